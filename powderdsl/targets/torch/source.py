@@ -10,7 +10,7 @@ from zlib import crc32
 
 from powderdsl.ir.ops import Node, PassGraph, Program, nodes_of
 
-_PLANE = re.compile(r"\b[ns][0-9]+\b")
+_PLANE = re.compile(r"\b[bfmns][0-9]+\b")
 
 
 class _Writer:
@@ -164,17 +164,17 @@ def pass_source(pass_: PassGraph, number: int) -> tuple[str, str, dict[str, obje
     for node in nodes_of(pass_, substeps=False):
         if node.places and node.places[0] != place:
             place = node.places[0]
-            writer.lines.append(f"# {_comment(place)}")
+            writer.lines.append(f"# {comment_of(place)}")
         writer.node(node)
     name = f"pass_{number}"
     returned = ", ".join(f"{slot!r}: k.full({writer.names[node]})" for slot, node in pass_.outputs)
-    header = [f"# {_comment(pass_.name)}"] + [f"# {key} = {value}" for key, value in writer.constants.items()]
-    lines = [f"    {line}" for line in _with_deletions(writer.lines, returned)]
+    header = [f"# {comment_of(pass_.name)}"] + [f"# {key} = {value}" for key, value in writer.constants.items()]
+    lines = [f"    {line}" for line in with_deletions(writer.lines, returned)]
     source = "\n".join([*header, f"def {name}(k, state):", *lines, f"    return {{{returned}}}"])
     return source + "\n", name, writer.constants
 
 
-def _with_deletions(lines: list[str], returned: str) -> list[str]:
+def with_deletions(lines: list[str], returned: str) -> list[str]:
     """The lines with `del` after the last use of each plane, so that a large world needs memory for few planes at once."""
     live = set(_PLANE.findall(returned))
     result: list[str] = []
@@ -188,7 +188,7 @@ def _with_deletions(lines: list[str], returned: str) -> list[str]:
     return result[::-1]
 
 
-def _comment(text: str) -> str:
+def comment_of(text: str) -> str:
     """A place as a comment. File names come from users: nothing in them may end the comment."""
     return "".join(char if char.isprintable() and ord(char) < 128 else "?" for char in text)
 

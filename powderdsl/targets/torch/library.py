@@ -1,0 +1,419 @@
+"""What generated functions on bit planes call: neighbors, movements, draws, and floats where flags hold.
+
+Words are int64, [..., H, B, K]: bit x % 64 of word x // 64 is column x. Bits beyond the last column are arbitrary. Planes of
+parameters, which all cells share, are broadcast. There are two libraries with the same operations:
+
+- `Portable`: for compilation and for any device. Cells are [H, W, B], so that neighbors lie along outer dimensions; masks of
+  cells are bool.
+- `Eager`: for CPUs without compilation. Cells are [H, B, W], so that the bytes of a word lie in order; masks of cells are
+  int32 of all ones or zeros, since `torch.where` branches for each cell.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.nn.functional import pad
+
+from powderdsl.ir.ops import SNAP
+from powderdsl.schedule.types import Leftover
+from powderdsl.targets.tensor_kind import WORD, word_count
+
+_ALL = (1 << WORD) - 1
+
+
+def _signed(word: int) -> int:
+    """The int64 with some 64 bits."""
+    return word - (1 << WORD) if word >> (WORD - 1) else word
+
+
+class Portable:
+    """The operations on words and cells of worlds of one size."""
+
+    def __init__(self, batch: int, height: int, width: int, device: torch.device):
+        self.batch, self.height, self.width, self.device = batch, height, width, device
+        self.across = word_count(width)
+        self.shape = (height, batch, self.across)
+        self.everywhere, self.nowhere = self._by_row([-1]), self._by_row([0])
+        self.valid = self._by_row([(1 << width) - 1])
+        self.bit = torch.arange(WORD, device=device)
+        self.fixed: dict[Any, Any] = {}
+        """Constants of this size that were computed before, by any key."""
+
+    def whole(self, plane: Tensor) -> Tensor:
+        """A plane [H, B, K], or some: those that all cells share are expanded."""
+        return plane if plane.shape[-3:] == self.shape else plane.expand(*plane.shape[:-3], *self.shape)
+
+    def stack(self, planes: Sequence[Tensor]) -> Tensor:
+        """Planes as one tensor [planes, H, B, K]."""
+        return torch.stack([self.whole(plane) for plane in planes])
+
+    # Neighbors
+
+    def rows(self, plane: Tensor, dy: int) -> Tensor:
+        """The plane at the neighbor `dy` rows below, as a new tensor; rows wrap."""
+        return torch.roll(self.whole(plane), -dy, -3)
+
+    def columns(self, plane: Tensor, dx: int) -> Tensor:
+        """The plane at the neighbor `dx` columns to the right, as a new tensor; columns wrap."""
+        plane = self.whole(plane)
+        if self.width % WORD:
+            plane = plane & self.valid
+        by = dx % self.width
+        return self._right(plane, by) | self._left(plane, self.width - by)
+
+    def _right(self, plane: Tensor, by: int) -> Tensor:
+        words, bits = divmod(by, WORD)
+        plane = self._words(plane, words)
+        if not bits:
+            return plane
+        lower = (plane >> bits) & ((1 << (WORD - bits)) - 1)
+        return lower | (self._words(plane, 1) << (WORD - bits)) if self.across > 1 else lower
+
+    def _left(self, plane: Tensor, by: int) -> Tensor:
+        words, bits = divmod(by, WORD)
+        plane = self._words(plane, -words)
+        if not bits:
+            return plane
+        if self.across == 1:
+            return plane << bits
+        return (plane << bits) | ((self._words(plane, -1) >> (WORD - bits)) & ((1 << bits) - 1))
+
+    def _words(self, plane: Tensor, by: int) -> Tensor:
+        """The words `by` places further in each row, and zeros."""
+        if not by:
+            return plane
+        if abs(by) >= self.across:
+            return torch.zeros_like(plane)
+        return pad(plane[..., by:], (0, by)) if by > 0 else pad(plane[..., :by], (-by, 0))
+
+    def shift(self, plane: Tensor, dy: int, dx: int) -> Tensor:
+        """The plane at a neighbor; the grid wraps."""
+        if dx:
+            plane = self.columns(plane, dx)
+        return self.rows(plane, dy) if dy or not dx else plane
+
+    def inside(self, dy: int, dx: int) -> Tensor:
+        """The cells whose neighbor lies inside the grid."""
+        columns = sum(1 << x for x in range(self.width) if 0 <= x + dx < self.width)
+        return self._by_row([columns if 0 <= y + dy < self.height else 0 for y in range(self.height)])
+
+    def inside_mask(self, dy: int, dx: int) -> Tensor:
+        """The same as a mask."""
+        return self.mask(self.inside(dy, dx))
+
+    def row(self, modulus: int, bit: int) -> Tensor:
+        """A bit of the number of each row, modulo a number."""
+        return self._by_row([-(y % modulus >> bit & 1) for y in range(self.height)])
+
+    def column(self, modulus: int, bit: int) -> Tensor:
+        """A bit of the number of each column, modulo a number."""
+        return self._by_row([sum(1 << x for x in range(self.width) if x % modulus >> bit & 1)])
+
+    def _by_row(self, rows: Sequence[int]) -> Tensor:
+        """A plane of the columns of each row, or of all rows."""
+        words = [[_signed(row >> i & _ALL) for i in range(0, self.across * WORD, WORD)] for row in rows]
+        return torch.tensor(words, device=self.device)[:, None]
+
+    # Movements of planes [P, H, B, K]. No cell is a mover and a target of the same exchange.
+
+    def swap(self, planes: Tensor, movers: Tensor, dy: int, dx: int) -> Tensor:
+        """Planes whose movers and targets are exchanged."""
+        targets = self.shift(movers, -dy, -dx)
+        there, back = self.shift(planes, dy, dx), self.shift(planes, -dy, -dx)
+        return (planes & ~(movers | targets)) | (there & movers) | (back & targets)
+
+    def left(self, *kinds: Leftover) -> Any:
+        """What movers leave behind in each plane, in the form that `leave` takes."""
+        shown = [[[[-(kind == of)]]] for of in ("same", "everything") for kind in kinds]
+        return torch.tensor(shown, device=self.device).view(2, -1, 1, 1, 1)
+
+    def leave(self, planes: Tensor, movers: Tensor, dy: int, dx: int, left: Any) -> Tensor:
+        """Planes whose targets get what the movers hold; other movers leave something behind."""
+        targets = self.shift(movers, -dy, -dx)
+        stays, fills = left
+        rest = (planes & (~movers | stays)) | (movers & fills)
+        return (rest & ~targets) | self.shift(planes & movers, -dy, -dx)
+
+    def arrive(self, planes: Tensor, movers: Tensor, rest: Tensor, dy: int, dx: int) -> Tensor:
+        """Other planes, whose targets get what the movers hold in these."""
+        targets = self.shift(movers, -dy, -dx)
+        return rest ^ (targets & (rest ^ self.shift(planes, -dy, -dx)))
+
+    def exchange(self, planes: Tensor, movers: Tensor, rest: Tensor, dy: int, dx: int) -> Tensor:
+        """Other planes, whose movers and targets get what their partners hold in these."""
+        arrived = self.arrive(planes, movers, rest, dy, dx)
+        return arrived ^ (movers & (arrived ^ self.shift(planes, dy, dx)))
+
+    # Draws: planes [bits, H, B, K] of the inverted bits of a number of each cell, highest first
+
+    def chance(self, draws: Sequence[Tensor], limit: int, bits: int) -> Tensor:
+        """The cells whose number of some bits is below a limit."""
+        if not 0 < limit < 1 << bits:
+            return self.everywhere if limit > 0 else self.nowhere
+        low = (limit & -limit).bit_length() - 1
+        below = draws[bits - low - 1]
+        for i in range(low + 1, bits):
+            below = below | draws[bits - 1 - i] if limit >> i & 1 else below & draws[bits - 1 - i]
+        return below
+
+    def below(self, draws: Sequence[Tensor], limit: int | Sequence[Tensor]) -> Tensor:
+        """The cells whose number is below a limit: one number, or planes of each world's number, highest bit first."""
+        if isinstance(limit, int):
+            return self.chance(draws, limit, len(draws))
+        below = self.nowhere
+        bits = len(limit) - 1
+        for i in range(bits):
+            draw, bit = draws[bits - 1 - i], limit[bits - i]
+            below = (draw & (bit | below)) | (bit & below)
+        return below | limit[0]
+
+    def draw(self, draws: Sequence[Tensor], bits: int) -> Tensor:
+        """A number of each cell in (0, 1), float32."""
+        number = torch.zeros((), dtype=torch.int64, device=self.device)
+        for i in range(bits):
+            number = (number << 1) | (1 - self.bits(draws[i]).to(torch.int64))
+        return ((number.double() + 0.5) / float(1 << bits)).float()
+
+    # Cells
+
+    def to_cells(self, array: Tensor) -> Tensor:
+        """An array [..., B, H, W] in the order of cells."""
+        return array.movedim(-3, -1)
+
+    def from_cells(self, cells: Tensor) -> Tensor:
+        """Cells as an array [..., B, H, W]."""
+        return cells.movedim(-1, -3)
+
+    def each_world(self, value: Tensor) -> Tensor:
+        """A number of each world [B] for cells."""
+        return value[None, None]
+
+    def bits(self, plane: Tensor) -> Tensor:
+        """The flags of each cell, as integers 0 and 1."""
+        bits = (self.whole(plane)[..., None] >> self.bit) & 1  # [..., H, B, K, 64]
+        return bits.flatten(-2)[..., : self.width].movedim(-2, -1)
+
+    def mask(self, plane: Tensor) -> Tensor:
+        """The flags of each cell, in the form that `choose` takes."""
+        return self.bits(plane) != 0
+
+    def pack(self, flags: Tensor) -> Tensor:
+        """Flags of cells, bool, as a new plane."""
+        flags = flags.expand(*flags.shape[:-3], self.height, self.width, self.batch).to(torch.int64)
+        flags = pad(flags, (0, 0, 0, self.across * WORD - self.width)).unflatten(-2, (self.across, WORD))
+        return (flags << self.bit[:, None]).sum(-2).movedim(-2, -1)
+
+    def compare(self, op: str, a: Tensor | float, b: Tensor | float) -> Tensor:
+        """The cells where a float equals another (`eq`), or is less (`lt`, `le`), as a new plane."""
+        return self.pack(getattr(torch, op)(self.tensor(a), self.tensor(b)))
+
+    def all_cells(self, value: Tensor | float) -> Tensor:
+        """A float of each cell: values that cells share are expanded."""
+        return self.tensor(value).expand(self.height, self.width, self.batch).contiguous()
+
+    def tensor(self, value: Tensor | float) -> Tensor:
+        """A constant as a tensor: some devices multiply by the reciprocal of a number, which rounds differently."""
+        return torch.full((), value, device=self.device) if isinstance(value, float) else value
+
+    def neighbor(self, value: Tensor | float, dy: int, dx: int) -> Tensor:
+        """The float at a neighbor; the grid wraps."""
+        return self._roll(self.all_cells(value), dy, dx)
+
+    def _roll(self, cells: Tensor, dy: int, dx: int) -> Tensor:
+        return torch.roll(cells, (-dy, -dx), (0, 1))
+
+    def choose(self, mask: Tensor, yes: Tensor | float, no: Tensor | float) -> Tensor:
+        """One float where a mask holds, the other elsewhere."""
+        return torch.where(mask, self.tensor(yes), self.tensor(no))
+
+    def increase(self, value: Tensor | float, mask: Tensor, by: Tensor | float, sign: int = 1) -> Tensor:
+        """A float, increased or decreased where a mask holds."""
+        return self.choose(mask, value + by if sign > 0 else value - by, value)
+
+    def carry(self, value: Tensor, mask: Tensor, amount: Tensor, dy: int, dx: int) -> Tensor:
+        """A float of which an amount leaves where a mask holds, and arrives where it holds at a neighbor."""
+        left = self.choose(mask, value - amount, value)
+        amount = self.all_cells(amount)
+        return self.choose(self._roll(mask, dy, dx), left + self._roll(amount, dy, dx), left)
+
+    increase_, carry_ = increase, carry
+    """The same, which may overwrite the first argument."""
+
+    def divide(self, a: Tensor | float, b: Tensor | float) -> Tensor:
+        """The quotient; 0 where the divisor is 0."""
+        a, b = self.tensor(a), self.tensor(b)
+        return torch.where(b == 0, 0.0, a / b)
+
+    def minimum(self, a: Tensor | float, b: Tensor | float) -> Tensor:
+        """The smaller float; NaN if either is."""
+        return torch.minimum(self.tensor(a), self.tensor(b))
+
+    def maximum(self, a: Tensor | float, b: Tensor | float) -> Tensor:
+        """The larger float; NaN if either is."""
+        return torch.maximum(self.tensor(a), self.tensor(b))
+
+    def square_root(self, value: Tensor) -> Tensor:
+        """The square root, rounded correctly, which not every device does for float32."""
+        return torch.sqrt(value.double()).float()
+
+    def settle(self, value: Tensor, low: float, high: float) -> Tensor:
+        """No NaN, within bounds, nothing smaller than `SNAP`."""
+        value = torch.where(value == value, value, 0.0).clamp(low, high)
+        return torch.where(value.abs() < SNAP, 0.0, value)
+
+
+_BITS = torch.tensor([[octet >> i & 1 for i in range(8)] for octet in range(256)], dtype=torch.uint8)
+_MASKS = -_BITS.to(torch.int32)
+_GATHER = 0x0102040810204080
+"""Times this, a word of eight bytes 0 or 1 has them as the bits of its last byte."""
+_BELOW_SNAP = float(np.nextafter(np.float32(SNAP), np.float32(0)))
+
+
+def _pattern(value: float) -> int:
+    """The bits of a float32."""
+    return int(np.float32(value).view(np.int32))
+
+
+class Eager(Portable):
+    """The operations for CPUs, which are little endian."""
+
+    def columns(self, plane: Tensor, dx: int) -> Tensor:
+        by = dx % self.width
+        if self.across > 1 or not by:
+            return super().columns(plane, dx)
+        plane = self.whole(plane)
+        if self.width < WORD:
+            plane = plane & self.valid
+        right = (plane >> by).bitwise_and_((1 << (WORD - by)) - 1)
+        return right.bitwise_or_(plane << (self.width - by))
+
+    def swap(self, planes: Tensor, movers: Tensor, dy: int, dx: int) -> Tensor:
+        change = self.shift(planes, dy, dx).bitwise_xor_(planes).bitwise_and_(movers)
+        return self.shift(change, -dy, -dx).bitwise_xor_(change).bitwise_xor_(planes)
+
+    def left(self, *kinds: Leftover) -> Any:
+        return kinds
+
+    def leave(self, planes: Tensor, movers: Tensor, dy: int, dx: int, left: Any) -> Tensor:
+        targets = self.shift(movers, -dy, -dx)
+        rest = planes & ~movers
+        for i, kind in enumerate(left):
+            if kind == "everything":
+                rest[i].bitwise_or_(movers)
+            elif kind == "same":
+                rest[i].copy_(planes[i])
+        arrived = self.shift(planes & movers, -dy, -dx)
+        return rest.bitwise_and_(targets.bitwise_not_()).bitwise_or_(arrived)
+
+    def chance(self, draws: Sequence[Tensor], limit: int, bits: int) -> Tensor:
+        if not 0 < limit < 1 << bits or limit & (limit - 1) == 0:
+            return super().chance(draws, limit, bits)
+        low = (limit & -limit).bit_length() - 1
+        below = draws[bits - low - 1].clone()
+        for i in range(low + 1, bits):
+            draw = draws[bits - 1 - i]
+            below = below.bitwise_or_(draw) if limit >> i & 1 else below.bitwise_and_(draw)
+        return below
+
+    def to_cells(self, array: Tensor) -> Tensor:
+        return array.movedim(-3, -2)
+
+    def from_cells(self, cells: Tensor) -> Tensor:
+        return cells.movedim(-3, -2)
+
+    def each_world(self, value: Tensor) -> Tensor:
+        return value[None, :, None]
+
+    def bits(self, plane: Tensor) -> Tensor:
+        return self._expanded(plane, _BITS)
+
+    def mask(self, plane: Tensor) -> Tensor:
+        return self._expanded(plane, _MASKS)
+
+    def _expanded(self, plane: Tensor, table: Tensor) -> Tensor:
+        """The row of a table for each byte of a plane."""
+        octets = self.whole(plane).contiguous().view(torch.uint8)
+        return torch.embedding(table, octets.to(torch.int32)).flatten(-2)[..., : self.width]
+
+    def compare(self, op: str, a: Tensor | float, b: Tensor | float) -> Tensor:
+        # A comparison whose result is a float takes a sixth of the time.
+        numbers = torch.empty(self.height, self.batch, self.width)
+        return self.pack(getattr(torch, op)(self.tensor(a), self.tensor(b), out=numbers).to(torch.bool))
+
+    def pack(self, flags: Tensor) -> Tensor:
+        flags = flags.expand(*flags.shape[:-3], self.height, self.batch, self.width).view(torch.uint8)
+        flags = pad(flags, (0, -self.width % WORD)).contiguous().view(torch.int64)
+        return (flags * _GATHER).view(torch.uint8)[..., 7::8].contiguous().view(torch.int64)
+
+    def all_cells(self, value: Tensor | float) -> Tensor:
+        return self.tensor(value).expand(self.height, self.batch, self.width).contiguous()
+
+    def _roll(self, cells: Tensor, dy: int, dx: int) -> Tensor:
+        return torch.roll(cells, (-dy, -dx), (0, 2))
+
+    def choose(self, mask: Tensor, yes: Tensor | float, no: Tensor | float) -> Tensor:
+        if isinstance(no, float):
+            if isinstance(yes, float):
+                return (mask & (_pattern(yes) ^ _pattern(no))).bitwise_xor_(self._int(no)).view(torch.float32)
+            if not no:
+                return (mask & self._int(yes)).view(torch.float32)
+        no = self._int(no)
+        return (self._int(yes) ^ no).bitwise_and(mask).bitwise_xor(no).view(torch.float32)
+
+    def _int(self, value: Tensor | float) -> Tensor:
+        return self.tensor(value).view(torch.int32)
+
+    def increase(self, value: Tensor | float, mask: Tensor, by: Tensor | float, sign: int = 1) -> Tensor:
+        # x + 0 = x, except that -0 becomes 0, which no rule can tell apart and no field holds.
+        return torch.add(self.tensor(value), self.choose(mask, by, 0.0), alpha=sign)
+
+    def increase_(self, value: Tensor, mask: Tensor, by: Tensor | float, sign: int = 1) -> Tensor:
+        return value.add_(self.choose(mask, by, 0.0), alpha=sign)
+
+    def carry(self, value: Tensor, mask: Tensor, amount: Tensor, dy: int, dx: int) -> Tensor:
+        return self.carry_(self.all_cells(value).clone(), mask, amount, dy, dx)
+
+    def carry_(self, value: Tensor, mask: Tensor, amount: Tensor, dy: int, dx: int) -> Tensor:
+        moved, neighbors, borders = self._framed(dy, dx)
+        torch.bitwise_and(self._int(amount), mask, out=moved.view(torch.int32))
+        for border, cells in borders:
+            border.copy_(cells)
+        return value.sub_(moved).add_(neighbors)
+
+    def _framed(self, dy: int, dx: int) -> tuple[Tensor, Tensor, list[tuple[Tensor, Tensor]]]:
+        """Memory for a float of each cell, the part of it at a neighbor, and what must be copied around the edges."""
+        if ("framed", dy, dx) not in self.fixed:
+            (height, ys, to_y, edge_y), (width, xs, to_x, edge_x) = _frame(dy, self.height), _frame(dx, self.width)
+            frame = torch.empty(height, self.batch, width)
+            borders = [(frame[ys, :, border], frame[ys, :, cells]) for border, cells in edge_x]
+            borders += [(frame[border], frame[cells]) for border, cells in edge_y]
+            self.fixed["framed", dy, dx] = (frame[ys, :, xs], frame[to_y, :, to_x], borders)
+        framed: tuple[Tensor, Tensor, list[tuple[Tensor, Tensor]]] = self.fixed["framed", dy, dx]
+        return framed
+
+    def square_root(self, value: Tensor) -> Tensor:
+        return torch.from_numpy(np.sqrt(value.numpy()))  # rounded correctly, as torch does only for float64
+
+    def settle(self, value: Tensor, low: float, high: float) -> Tensor:
+        value = value.clamp(low, high).nan_to_num_(nan=0.0, posinf=high, neginf=low)
+        return torch.nn.functional.hardshrink(value, _BELOW_SNAP)
+
+
+def _frame(by: int, size: int) -> tuple[int, slice, slice, list[tuple[slice, slice]]]:
+    """An axis with room for neighbors around the edge: its size, the cells, their neighbors, borders and what they repeat."""
+    by = (by + size // 2) % size - size // 2
+    before = max(-by, 0)
+    cells, neighbors = slice(before, before + size), slice(before + by, before + by + size)
+    if by > 0:
+        return size + by, cells, neighbors, [(slice(size, size + by), slice(by))]
+    return size - by, cells, neighbors, [(slice(-by), slice(size, size - by))] if by else []
+
+
+def library(batch: int, height: int, width: int, device: torch.device, *, eager: bool) -> Portable:
+    """The operations for worlds of one size."""
+    return (Eager if eager else Portable)(batch, height, width, device)

@@ -1,0 +1,240 @@
+"""The torch backend on bit planes: batches as words, steps as generated functions of tensors, eager or compiled."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.nn.functional import pad
+
+from powderdsl.ir.ops import REAL, Program, nodes_of
+from powderdsl.system.random import MASK, base_keys
+from powderdsl.targets.job import Clock, Job, Like, PackedArrays, like_of, shape_of
+from powderdsl.targets.layout import limits, pieces
+from powderdsl.targets.torch.library import Portable, library
+from powderdsl.targets.torch.planes import Key, pass_source
+from powderdsl.targets.torch.program import step_keys
+from powderdsl.targets.torch.source import load_source
+
+CHUNK = 1 << 19
+"""Cells of the worlds that an eager program steps together: about as many as the cache holds."""
+
+Batch = tuple[Tensor, tuple[Tensor, ...]]
+"""Words of all planes, int64 [planes, H, B, K], and floats of each field, see `library`."""
+
+
+class PlanesState(PackedArrays):
+    """A batch as chunks of worlds on bit planes."""
+
+    __slots__ = ("chunks", "program")
+
+    def __init__(self, program: PlanesProgram, chunks: Sequence[Batch], like: Like):
+        super().__init__(like)
+        self.program, self.chunks = program, chunks
+
+    def unpack(self, name: str) -> Tensor:
+        return torch.cat([self.program.unpack(chunk, name, self.like) for chunk in self.chunks])
+
+
+@dataclass
+class _Pass:
+    name: str
+    function: Callable[..., Batch]
+    inputs: tuple[Key, ...]
+
+
+class PlanesProgram:
+    """A program on bit planes, whose passes are generated torch functions.
+
+    `program` is the same on numbers. With `fuse`, `torch.compile` makes the functions.
+    """
+
+    def __init__(self, program: Program, planes: Program, device: torch.device, *, fuse: bool = False):
+        self.device, self.planes = device, planes
+        self.eager = device.type == "cpu" and sys.byteorder == "little" and not fuse
+        self._pieces = pieces(program)
+        names = [slot.name for slot in planes.slots if slot.type != REAL]
+        self._number = {name: i for i, name in enumerate(names)}
+        self._fields = [slot.name for slot in planes.slots if slot.type == REAL]
+        self._streams = {name: ident for name, ident, _ in planes.streams}
+        self._bits = _significant_bits(planes)
+        self._passes = []
+        for i, pass_ in enumerate(planes.passes):
+            source = pass_source(planes, pass_, i)
+            function = load_source(source.text, source.name, {"inf": float("inf"), "nan": float("nan")})
+            self._passes.append(_Pass(pass_.name, function, source.inputs))
+        self._libraries: dict[tuple[int, int, int], Portable] = {}
+        self._settings: tuple[Any, int, list[dict[Key, Any]]] | None = None
+        """The parameters of the last job, the worlds of a chunk, and what they are for the inputs of passes."""
+
+    def run(self, job: Job) -> Mapping[str, Tensor]:
+        """The state `job.steps` later; no host sync, except on the CPU."""
+        like = like_of(job.state)
+        batch, height, width = shape_of(job.state)
+        size = max(1, CHUNK // (height * width)) if self.eager else batch
+        if self._settings is None or self._settings[0] is not job.params or self._settings[1] != batch:
+            values = [{name: value[i : i + size] for name, value in job.params.items()} for i in range(0, batch, size)]
+            self._settings = (job.params, batch, [self._parameters(value) for value in values])
+        chunks = []
+        for number, start in enumerate(range(0, batch, size)):
+            part = slice(start, start + size)
+            k = self._library(min(size, batch - start), height, width)
+            if isinstance(job.state, PlanesState) and job.state.program is self:
+                chunk = job.state.chunks[number]
+            else:
+                chunk = self.pack(k, {name: array[part] for name, array in job.state.items()})
+            clock = Clock(*(array[part] for array in job.clock[:3]), since=job.clock.since)
+            with torch.inference_mode():
+                chunks.append(self._steps(k, chunk, job, clock, self._settings[2][number]))
+        return PlanesState(self, chunks, like)
+
+    def _library(self, batch: int, height: int, width: int) -> Portable:
+        key = (batch, height, width)
+        if key not in self._libraries:
+            if len(self._libraries) > 8:
+                self._libraries.clear()
+            self._libraries[key] = library(*key, self.device, eager=self.eager)
+        return self._libraries[key]
+
+    def _steps(self, k: Portable, chunk: Batch, job: Job, clock: Clock, settings: Mapping[Key, Any]) -> Batch:
+        words, fields = chunk
+        base = base_keys(clock.seed, clock.world)
+        fixed = {**settings, **{key: self._fixed(k, key) for key in self._keys("row", "column", "inside", "inside_mask", "left")}}
+        for i in range(job.steps):
+            step = clock.step + i
+            values = {**fixed, **self._draws(k, base, step)}
+            for key in self._keys("step"):
+                values[key] = -(step % key[1] >> key[2] & 1)[:, None]
+            words, fields = self._reset(k, words, fields)
+            job.tick("")
+            for pass_ in self._passes:
+                words, fields = pass_.function(k, words, fields, tuple([values[key] for key in pass_.inputs]))
+                job.tick(pass_.name)
+        return words, fields
+
+    def _keys(self, *kinds: str) -> list[Key]:
+        return [key for pass_ in self._passes for key in pass_.inputs if key[0] in kinds]
+
+    # Inputs of passes
+
+    def _fixed(self, k: Portable, key: Key) -> Any:
+        """What depends on the grid only."""
+        if key not in k.fixed:
+            k.fixed[key] = getattr(k, key[0])(*key[1:])
+        return k.fixed[key]
+
+    def _parameters(self, params: Mapping[str, Tensor]) -> dict[Key, Any]:
+        """What depends on parameters. Limits that all worlds share are numbers where that costs no sync."""
+        values: dict[Key, Any] = {}
+        for key in self._keys("limit", "bit", "real"):
+            kind, name, *rest = key
+            value = params[name]
+            if kind == "real":
+                values[key] = value.to(torch.float32)[:, None] if self.eager else value.to(torch.float32)
+                continue
+            threshold, *bit = rest
+            number = value.to(torch.int64) if threshold is None else limits(torch, value, threshold)
+            if kind == "bit":
+                values[key] = -(number >> bit[0] & 1)[:, None]
+            elif self.eager and bool((number == number[0]).all()):
+                values[key] = int(number[0])
+            else:
+                values[key] = tuple([-(number >> i & 1)[:, None] for i in range(threshold.bits, -1, -1)])
+        return values
+
+    def _draws(self, k: Portable, base: Tensor, step: Tensor) -> dict[Key, Any]:
+        """The numbers of each stream in a step, as planes."""
+        streams = [*dict.fromkeys(self._keys("draws"))]
+        if not streams:
+            return {}
+        idents = torch.tensor([self._streams[name] for _, name in streams], device=self.device)
+        keys = step_keys(base, step, idents).to(torch.int32)
+        return {key: drawn_planes(k, keys[i], self._bits[key[1]]).unbind() for i, key in enumerate(streams)}
+
+    def _reset(self, k: Portable, words: Tensor, fields: tuple[Tensor, ...]) -> Batch:
+        resets = [slot for slot in self.planes.slots if slot.resets]
+        planes = {self._number[slot.name]: slot for slot in resets if slot.type != REAL}
+        if planes:
+            words = words.clone()
+            for number, slot in planes.items():
+                words[number] = -int(slot.default)
+        floats = {slot.name: float(slot.default) for slot in resets if slot.type == REAL}
+        parts = zip(self._fields, fields, strict=True)
+        return words, tuple([k.all_cells(floats[name]) if name in floats else value for name, value in parts])
+
+    # States
+
+    def pack(self, k: Portable, state: Mapping[str, Tensor]) -> Batch:
+        """Arrays of a state as words and fields."""
+        planes: dict[int, Tensor] = {}
+        fields: dict[str, Tensor] = {}
+        for name, array in state.items():
+            for piece in self._pieces[name]:
+                cells = k.to_cells(piece.of(array))
+                if piece.is_real:
+                    fields[piece.slot] = cells.contiguous()
+                    continue
+                for i, plane in enumerate(piece.planes):
+                    flags = (cells >> i & 1) != 0 if piece.type.name == "int" else cells != 0
+                    planes[self._number[plane]] = k.pack(flags)
+        stacked = k.stack([planes[i] for i in range(len(planes))])
+        return stacked, tuple([fields[name] for name in self._fields])
+
+    def unpack(self, chunk: Batch, name: str, like: Like) -> Tensor:
+        """One array of a state, in its storage dtype."""
+        words, fields = chunk
+        k = self._library(words.shape[2], words.shape[1], like["element"][1][2])
+        dtype = like[name][0]
+        parts = []
+        for piece in self._pieces[name]:
+            if piece.is_real:
+                parts.append(k.from_cells(fields[self._fields.index(piece.slot)]))
+                continue
+            bits = k.bits(torch.stack([words[self._number[plane]] for plane in piece.planes])).to(torch.int32)
+            weights = [1 << i for i in range(len(bits))]
+            if piece.signed:
+                weights[-1] = -weights[-1]
+            total = (bits * torch.tensor(weights, dtype=torch.int32, device=bits.device).view(-1, 1, 1, 1)).sum(0)
+            parts.append(k.from_cells(total))
+        whole = parts[0] if self._pieces[name][0].component is None else torch.stack(parts, 1)
+        return whole.to(dtype).contiguous()
+
+
+def drawn_planes(k: Portable, keys: Tensor, bits: int) -> Tensor:
+    """The inverted bits of a stream's draws, highest first: int64 [bits, H, B, K].
+
+    `keys` is int32 [2, B]. As `program.words`, in int32, which wraps as the hash does.
+    """
+    across = -(-k.width // 32)
+    if ("numbers", bits) not in k.fixed:
+        number = torch.arange(k.height * across, dtype=torch.int64, device=k.device).view(k.height, 1, across) * 32
+        plane = torch.arange(bits, dtype=torch.int64, device=k.device).view(-1, 1, 1, 1)
+        k.fixed["numbers", bits] = (((number + plane) * 0x9E3779B1) & MASK).to(torch.int32)
+    h = k.fixed["numbers", bits] + keys[0][:, None]
+    h = (h ^ ((h >> 16) & 0xFFFF)) * 0x7FEB352D
+    h = h ^ ((h >> 15) & 0x1FFFF)
+    h = (h + keys[1][:, None]) * (0x846CA68B - (1 << 32))
+    h = ~(h ^ ((h >> 16) & 0xFFFF))
+    if across % 2:
+        h = pad(h, (0, 1))
+    if sys.byteorder == "little" and k.device.type == "cpu":
+        return h.view(torch.int64)
+    return (h[..., ::2].to(torch.int64) & MASK) | (h[..., 1::2].to(torch.int64) << 32)
+
+
+def _significant_bits(planes: Program) -> dict[str, int]:
+    """The number of bits of each stream that a program needs: those above the lowest bits of constant limits, which are 0."""
+    bits: dict[str, int] = {}
+    for pass_ in planes.passes:
+        for node in nodes_of(pass_, substeps=False):
+            if node.op in ("chance", "below_planes", "draw"):
+                stream, own, *limit = node.attr
+                if limit and limit[0]:
+                    own -= (limit[0] & -limit[0]).bit_length() - 1
+                bits[stream] = max(bits.get(stream, 1), own)
+    return bits
