@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from contextlib import nullcontext, suppress
 from dataclasses import replace
-from functools import cache
+from functools import cache, partial
 from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -97,10 +97,7 @@ def make_program(
     |---------|-----------|------------------------|---------------|-------------|
     | any     | reference | oracle                 | oracle        | oracle      |
     | plain   | wasm      | wasm                   | oracle        | oracle      |
-    | tensors | wasm      | wasm                   | torch         | torch       |
-    | tensors | native    | native                 | torch         | torch       |
-    | tensors | cuda      | cuda                   | torch         | torch       |
-    | tensors | torch     | torch                  | torch         | torch       |
+    | tensors | others    | the backend            | torch-cells   | torch-cells |
 
     `auto` is wasm and later native code on the CPU; on other devices cuda, or torch where that is missing; with plain
     arrays wasm, or the oracle where that is missing.
@@ -109,7 +106,7 @@ def make_program(
         CompileError: PD701 if the backend is not available.
     """
     device, plain = kind.device, kind.xp.__name__ != "torch"
-    problem = "" if backend in ("reference", "torch", "native", "cuda") else _wasm_problem()
+    problem = _wasm_problem() if backend in ("auto", "wasm") else ""
     if backend == "reference" or (plain and backend == "auto" and problem):
         return BackendProgram("reference", ReferenceProgram(ruleset, kind))
     if backend in ("wasm", "native") and not kind.on_cpu:
@@ -125,31 +122,33 @@ def make_program(
         return BackendProgram(
             "wasm", _plain_program(ruleset, kind, memo), lambda: ReferenceProgram(ruleset, kind)
         )
+    from powderdsl.targets.torch.packed import PlanesProgram
     from powderdsl.targets.torch.program import TorchProgram
 
     # Made on first use: native code that was compiled before needs none of them.
     lowered, segments = cache(lambda: lower(ruleset)), cache(lambda: segments_of(ruleset))
     cells = cache(lambda: TorchProgram(lowered(), device))
-    wasm = cache(
-        lambda: mixed_program(
-            segments(),
-            lambda program, planes: WasmProgram(program, planes, kind),
-            lambda program: TorchProgram(program, device),
-        )
-    )
+
+    def packed(make: Callable[[Program, Program], Runnable]) -> Runnable:
+        return mixed_program(segments(), make, lambda program: TorchProgram(program, device))
+
+    wasm = cache(lambda: packed(lambda program, planes: WasmProgram(program, planes, kind)))
+    torch = cache(lambda: packed(partial(PlanesProgram, device=device, fuse=backend == "torch-fused")))
     if backend == "wasm":
         return BackendProgram("wasm", wasm(), cells)
     if backend == "native" or (backend == "auto" and kind.on_cpu):
         from powderdsl.simulation.native import ByWidth
 
-        first = None if backend == "native" else ("torch", cells) if problem else ("wasm", wasm)
+        first = None if backend == "native" else ("torch", torch) if problem else ("wasm", wasm)
         return BackendProgram(backend, ByWidth(ruleset, segments, threads, first, cells), cells)
     if backend == "cuda" or (backend == "auto" and device.type == "cuda"):
         from powderdsl.targets.cuda.program import cuda_program
 
         with suppress(CompileError) if backend == "auto" else nullcontext():
             return BackendProgram("cuda", cuda_program(lowered(), device), cells)
-    return BackendProgram("torch", cells())
+    if backend == "torch-cells":
+        return BackendProgram(backend, cells())
+    return BackendProgram(backend if backend == "torch-fused" else "torch", torch(), cells)
 
 
 @collection_paused()

@@ -7,7 +7,7 @@ from powderdsl.compiler import BACKENDS
 EMULATED = "cuda-emulated"
 """The name of the CUDA target where its kernels run on the CPU."""
 
-TARGETS = tuple(name for name in BACKENDS if name not in ("auto", "cuda", "reference"))
+TARGETS = tuple(name for name in BACKENDS if name not in ("auto", "cuda", "reference", "torch-fused"))
 """What runs on every machine: `auto` runs one of these, and the reference is what they are compared with."""
 
 COMPARED = (*TARGETS, EMULATED)

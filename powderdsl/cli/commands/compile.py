@@ -108,12 +108,16 @@ def _kernels(program: Program, backend: str, pass_name: str | None) -> Iterator[
         raise BadInput("the reference backend runs the checked model: it has no kernels")
     if backend in ("native", "cuda") and pass_name is not None:
         raise BadInput(f"{backend} source is one text: --pass does not go with it")
-    if backend == "torch":
+    if backend == "torch-cells":
         yield kernel_source(program, pass_name)
         return
     for part in segments(program):
         if part.planes is None:
             yield kernel_source(part.program, pass_name)
+        elif backend in ("torch", "torch-fused"):
+            from powderdsl.targets.torch.planes import planes_source
+
+            yield planes_source(part.planes, pass_name)
         elif backend == "native":
             from powderdsl.targets.cpp.source import native_source
 

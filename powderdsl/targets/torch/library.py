@@ -343,7 +343,7 @@ class Eager(Portable):
     def compare(self, op: str, a: Tensor | float, b: Tensor | float) -> Tensor:
         # A comparison whose result is a float takes a sixth of the time.
         numbers = torch.empty(self.height, self.batch, self.width)
-        return self.pack(getattr(torch, op)(self.tensor(a), self.tensor(b), out=numbers).to(torch.bool))
+        return self.pack(getattr(torch, op)(self.all_cells(a), self.tensor(b), out=numbers).to(torch.bool))
 
     def pack(self, flags: Tensor) -> Tensor:
         flags = flags.expand(*flags.shape[:-3], self.height, self.batch, self.width).view(torch.uint8)
@@ -388,7 +388,10 @@ class Eager(Portable):
     def _framed(self, dy: int, dx: int) -> tuple[Tensor, Tensor, list[tuple[Tensor, Tensor]]]:
         """Memory for a float of each cell, the part of it at a neighbor, and what must be copied around the edges."""
         if ("framed", dy, dx) not in self.fixed:
-            (height, ys, to_y, edge_y), (width, xs, to_x, edge_x) = _frame(dy, self.height), _frame(dx, self.width)
+            (height, ys, to_y, edge_y), (width, xs, to_x, edge_x) = (
+                _frame(dy, self.height),
+                _frame(dx, self.width),
+            )
             frame = torch.empty(height, self.batch, width)
             borders = [(frame[ys, :, border], frame[ys, :, cells]) for border, cells in edge_x]
             borders += [(frame[border], frame[cells]) for border, cells in edge_y]
@@ -397,7 +400,8 @@ class Eager(Portable):
         return framed
 
     def square_root(self, value: Tensor) -> Tensor:
-        return torch.from_numpy(np.sqrt(value.numpy()))  # rounded correctly, as torch does only for float64
+        with np.errstate(invalid="ignore"):
+            return torch.from_numpy(np.sqrt(value.numpy()))  # rounded correctly, as torch does only for float64
 
     def settle(self, value: Tensor, low: float, high: float) -> Tensor:
         value = value.clamp(low, high).nan_to_num_(nan=0.0, posinf=high, neginf=low)
@@ -412,8 +416,3 @@ def _frame(by: int, size: int) -> tuple[int, slice, slice, list[tuple[slice, sli
     if by > 0:
         return size + by, cells, neighbors, [(slice(size, size + by), slice(by))]
     return size - by, cells, neighbors, [(slice(-by), slice(size, size - by))] if by else []
-
-
-def library(batch: int, height: int, width: int, device: torch.device, *, eager: bool) -> Portable:
-    """The operations for worlds of one size."""
-    return (Eager if eager else Portable)(batch, height, width, device)

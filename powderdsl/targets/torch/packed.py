@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
-from functools import partial
+from dataclasses import dataclass
+from threading import get_ident
 from typing import Any
 
 import torch
@@ -14,15 +14,17 @@ from torch.nn.functional import pad
 
 from powderdsl.ir.ops import REAL, Program, nodes_of
 from powderdsl.system.random import MASK, base_keys
-from powderdsl.targets.job import Clock, Job, Like, PackedArrays, like_of, shape_of
+from powderdsl.targets.job import Job, Like, PackedArrays, like_of, shape_of
 from powderdsl.targets.layout import limits, pieces
-from powderdsl.targets.torch.library import Portable, library
+from powderdsl.targets.torch.library import Eager, Portable
 from powderdsl.targets.torch.planes import Key, pass_source
 from powderdsl.targets.torch.program import step_keys
 from powderdsl.targets.torch.source import load_source
 
 CHUNK = 1 << 19
 """Cells of the worlds that an eager program steps together: about as many as the cache holds."""
+
+MOST_LIBRARIES = 8
 
 Batch = tuple[Tensor, tuple[Tensor, ...]]
 """Words of all planes, int64 [planes, H, B, K], and floats of each field, see `library`."""
@@ -68,45 +70,51 @@ class PlanesProgram:
             source = pass_source(planes, pass_, i)
             function = load_source(source.text, source.name, {"inf": float("inf"), "nan": float("nan")})
             self._passes.append(_Pass(pass_.name, function, source.inputs))
-        self._libraries: dict[tuple[int, int, int], Portable] = {}
-        self._settings: tuple[Any, int, list[dict[Key, Any]]] | None = None
-        """The parameters of the last job, the worlds of a chunk, and what they are for the inputs of passes."""
+        self._libraries: dict[tuple[int, int, int, int], Portable] = {}
+        self._settings: tuple[Any, list[dict[Key, Any]]] | None = None
+        """The parameters of the last job, and the inputs of passes that depend on them, by chunk."""
 
     def run(self, job: Job) -> Mapping[str, Tensor]:
         """The state `job.steps` later; no host sync, except on the CPU."""
         like = like_of(job.state)
         batch, height, width = shape_of(job.state)
         size = max(1, CHUNK // (height * width)) if self.eager else batch
-        if self._settings is None or self._settings[0] is not job.params or self._settings[1] != batch:
-            values = [{name: value[i : i + size] for name, value in job.params.items()} for i in range(0, batch, size)]
-            self._settings = (job.params, batch, [self._parameters(value) for value in values])
+        parts = [slice(start, min(start + size, batch)) for start in range(0, batch, size)]
+        if self._settings is None or self._settings[0] is not job.params:
+            self._settings = (job.params, [self._parameters(job.params, part) for part in parts])
         chunks = []
-        for number, start in enumerate(range(0, batch, size)):
-            part = slice(start, start + size)
-            k = self._library(min(size, batch - start), height, width)
-            if isinstance(job.state, PlanesState) and job.state.program is self:
-                chunk = job.state.chunks[number]
-            else:
-                chunk = self.pack(k, {name: array[part] for name, array in job.state.items()})
-            clock = Clock(*(array[part] for array in job.clock[:3]), since=job.clock.since)
+        for number, (part, settings) in enumerate(zip(parts, self._settings[1], strict=True)):
             with torch.inference_mode():
-                chunks.append(self._steps(k, chunk, job, clock, self._settings[2][number]))
+                k = self._library(part.stop - part.start, height, width)
+                if isinstance(job.state, PlanesState) and job.state.program is self:
+                    chunk = job.state.chunks[number]
+                else:
+                    chunk = self.pack(k, {name: array[part] for name, array in job.state.items()})
+                seed, index, step = job.clock.seed[part], job.clock.world[part], job.clock.step[part]
+                chunks.append(self._steps(k, chunk, job, base_keys(seed, index), step, settings))
         return PlanesState(self, chunks, like)
 
     def _library(self, batch: int, height: int, width: int) -> Portable:
-        key = (batch, height, width)
+        key = (batch, height, width, get_ident())  # libraries have memory that threads must not share
         if key not in self._libraries:
-            if len(self._libraries) > 8:
+            if len(self._libraries) >= MOST_LIBRARIES:
                 self._libraries.clear()
-            self._libraries[key] = library(*key, self.device, eager=self.eager)
+            self._libraries[key] = (Eager if self.eager else Portable)(batch, height, width, self.device)
         return self._libraries[key]
 
-    def _steps(self, k: Portable, chunk: Batch, job: Job, clock: Clock, settings: Mapping[Key, Any]) -> Batch:
+    def _steps(
+        self, k: Portable, chunk: Batch, job: Job, base: Tensor, start: Tensor, settings: Mapping[Key, Any]
+    ) -> Batch:
         words, fields = chunk
-        base = base_keys(clock.seed, clock.world)
-        fixed = {**settings, **{key: self._fixed(k, key) for key in self._keys("row", "column", "inside", "inside_mask", "left")}}
+        fixed = {
+            **settings,
+            **{
+                key: self._fixed(k, key)
+                for key in self._keys("row", "column", "inside", "inside_mask", "left")
+            },
+        }
         for i in range(job.steps):
-            step = clock.step + i
+            step = start + i
             values = {**fixed, **self._draws(k, base, step)}
             for key in self._keys("step"):
                 values[key] = -(step % key[1] >> key[2] & 1)[:, None]
@@ -128,12 +136,12 @@ class PlanesProgram:
             k.fixed[key] = getattr(k, key[0])(*key[1:])
         return k.fixed[key]
 
-    def _parameters(self, params: Mapping[str, Tensor]) -> dict[Key, Any]:
+    def _parameters(self, params: Mapping[str, Tensor], part: slice) -> dict[Key, Any]:
         """What depends on parameters. Limits that all worlds share are numbers where that costs no sync."""
         values: dict[Key, Any] = {}
         for key in self._keys("limit", "bit", "real"):
             kind, name, *rest = key
-            value = params[name]
+            value = params[name][part]
             if kind == "real":
                 values[key] = value.to(torch.float32)[:, None] if self.eager else value.to(torch.float32)
                 continue
@@ -199,7 +207,9 @@ class PlanesProgram:
             weights = [1 << i for i in range(len(bits))]
             if piece.signed:
                 weights[-1] = -weights[-1]
-            total = (bits * torch.tensor(weights, dtype=torch.int32, device=bits.device).view(-1, 1, 1, 1)).sum(0)
+            total = (
+                bits * torch.tensor(weights, dtype=torch.int32, device=bits.device).view(-1, 1, 1, 1)
+            ).sum(0)
             parts.append(k.from_cells(total))
         whole = parts[0] if self._pieces[name][0].component is None else torch.stack(parts, 1)
         return whole.to(dtype).contiguous()
@@ -212,7 +222,9 @@ def drawn_planes(k: Portable, keys: Tensor, bits: int) -> Tensor:
     """
     across = -(-k.width // 32)
     if ("numbers", bits) not in k.fixed:
-        number = torch.arange(k.height * across, dtype=torch.int64, device=k.device).view(k.height, 1, across) * 32
+        number = (
+            torch.arange(k.height * across, dtype=torch.int64, device=k.device).view(k.height, 1, across) * 32
+        )
         plane = torch.arange(bits, dtype=torch.int64, device=k.device).view(-1, 1, 1, 1)
         k.fixed["numbers", bits] = (((number + plane) * 0x9E3779B1) & MASK).to(torch.int32)
     h = k.fixed["numbers", bits] + keys[0][:, None]

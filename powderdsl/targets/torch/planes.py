@@ -42,6 +42,12 @@ def pass_source(program: Program, pass_: PassGraph, number: int) -> Source:
     return Source("\n".join(text), name, tuple(writer.inputs))
 
 
+def planes_source(program: Program, only: str | None = None) -> str:
+    """The generated source of all passes on bit planes (or one), as `--emit kernels` prints it."""
+    passes = enumerate(program.passes)
+    return "\n\n".join(pass_source(program, p, i).text for i, p in passes if only is None or p.name == only)
+
+
 @dataclass
 class _Line:
     """A statement ``name = text``. `op` names an operation that makes a new tensor, or that may overwrite an argument."""
@@ -79,7 +85,11 @@ _IN_PLACE = {
     "abs": "{0}.abs_()",
 }
 """Operations that may overwrite their first argument; the others may overwrite the second one instead, unless it is `sub`."""
-_FLAGS = {**{op: f"{{0}} {sign} {{1}}" for op, sign in _GATES.items()}, "not": "~{0}", "select": "{2} ^ ({0} & ({1} ^ {2}))"}
+_FLAGS = {
+    **{op: f"{{0}} {sign} {{1}}" for op, sign in _GATES.items()},
+    "not": "~{0}",
+    "select": "{2} ^ ({0} & ({1} ^ {2}))",
+}
 _COMPARED = {"eq": "~({0} ^ {1})", "lt": "~{0} & {1}", "le": "~{0} | {1}"}
 """The comparison of two flags."""
 
@@ -199,7 +209,8 @@ class _Writer:
     def node(self, node: Node) -> None:
         """Write a node's value."""
         is_real = node.type == REAL
-        if is_real and node.args and all(arg in self.constants for arg in node.args):
+        folds = is_real and OPS[node.op].evaluate is not None
+        if folds and all(arg in self.constants for arg in node.args):
             # Python computes with float64: the result is rounded here.
             self.constant(node, OPS[node.op].value(node.attr, *map(self.constants.__getitem__, node.args)))
             return
@@ -224,7 +235,9 @@ class _Writer:
             case _:
                 text, args = self.real(node) if is_real else self.flag(node)
                 value = self.values[node] = self.name(text, "f" if is_real else "n", args, node.op)
-                whole = node.op in ("shift", "eq", "lt", "le", "draw") or text.startswith(("k.choose", "k.increase"))
+                whole = node.op in ("shift", "eq", "lt", "le", "draw") or text.startswith(
+                    ("k.choose", "k.increase")
+                )
                 if whole or not self.full.isdisjoint(args):
                     self.full.add(value)
 
@@ -305,7 +318,9 @@ class _Writer:
         if None in keys or keys[0] is None:
             return ()
         name, threshold, _ = keys[0]
-        whole = threshold is not None and keys == [(name, threshold, bit) for bit in range(threshold.bits, -1, -1)]
+        whole = threshold is not None and keys == [
+            (name, threshold, bit) for bit in range(threshold.bits, -1, -1)
+        ]
         return (name, threshold) if whole else ()
 
     # Movements
@@ -330,7 +345,9 @@ class _Writer:
             args = [contents.name, mask, rest.name]
             text = f"k.{'exchange' if op == 'swap' else 'arrive'}({contents.name}, {mask}, {rest.name}, {dy}, {dx})"
         planes: dict[Node, Node] = {node.args[0]: node for node in group}
-        moved = _Block(self.name(text, "b", args), [planes.get(plane) if plane else None for plane in contents.planes])
+        moved = _Block(
+            self.name(text, "b", args), [planes.get(plane) if plane else None for plane in contents.planes]
+        )
         for i, plane in enumerate(moved.planes):
             if plane is not None:
                 self.blocks[plane] = (moved, i)

@@ -10,6 +10,7 @@ from zlib import crc32
 
 from powderdsl.ir.ops import Node, PassGraph, Program, nodes_of
 
+_QUOTED = re.compile(r"'[^']*'")
 _PLANE = re.compile(r"\b[bfmns][0-9]+\b")
 
 
@@ -168,7 +169,9 @@ def pass_source(pass_: PassGraph, number: int) -> tuple[str, str, dict[str, obje
         writer.node(node)
     name = f"pass_{number}"
     returned = ", ".join(f"{slot!r}: k.full({writer.names[node]})" for slot, node in pass_.outputs)
-    header = [f"# {comment_of(pass_.name)}"] + [f"# {key} = {value}" for key, value in writer.constants.items()]
+    header = [f"# {comment_of(pass_.name)}"] + [
+        f"# {key} = {value}" for key, value in writer.constants.items()
+    ]
     lines = [f"    {line}" for line in with_deletions(writer.lines, returned)]
     source = "\n".join([*header, f"def {name}(k, state):", *lines, f"    return {{{returned}}}"])
     return source + "\n", name, writer.constants
@@ -179,7 +182,8 @@ def with_deletions(lines: list[str], returned: str) -> list[str]:
     live = set(_PLANE.findall(returned))
     result: list[str] = []
     for line in reversed(lines):
-        used = [] if line.startswith("#") else _PLANE.findall(line)
+        # Rules may call a field `n1`: what stands in quotes is no variable.
+        used = [] if line.startswith("#") else _PLANE.findall(_QUOTED.sub("", line))
         dead = sorted(set(used[1:]) - live)
         if dead:
             result.append(f"del {', '.join(dead)}")
