@@ -146,6 +146,14 @@ def make_program(
 
         with suppress(CompileError) if backend == "auto" else nullcontext():
             return BackendProgram("cuda", cuda_program(lowered(), device), cells)
+    if backend == "torch-fused" and kind.on_cpu:
+        from powderdsl.targets.cpp.build import NoCompiler, find_compiler
+        from powderdsl.targets.torch.fuse import not_compiled
+
+        try:
+            find_compiler()
+        except NoCompiler as error:
+            raise not_compiled(str(error)) from None
     if backend == "torch-cells":
         return BackendProgram(backend, cells())
     return BackendProgram(backend if backend == "torch-fused" else "torch", torch(), cells)

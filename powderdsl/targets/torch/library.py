@@ -372,8 +372,8 @@ class Eager(Portable):
         # x + 0 = x, except that -0 becomes 0, which no rule can tell apart and no field holds.
         return torch.add(self.tensor(value), self.choose(mask, by, 0.0), alpha=sign)
 
-    def increase_(self, value: Tensor, mask: Tensor, by: Tensor | float, sign: int = 1) -> Tensor:
-        return value.add_(self.choose(mask, by, 0.0), alpha=sign)
+    def increase_(self, value: Any, mask: Tensor, by: Tensor | float, sign: int = 1) -> Tensor:
+        return self.tensor(value).add_(self.choose(mask, by, 0.0), alpha=sign)
 
     def carry(self, value: Tensor, mask: Tensor, amount: Tensor, dy: int, dx: int) -> Tensor:
         return self.carry_(self.all_cells(value).clone(), mask, amount, dy, dx)
@@ -401,7 +401,9 @@ class Eager(Portable):
 
     def square_root(self, value: Tensor) -> Tensor:
         with np.errstate(invalid="ignore"):
-            return torch.from_numpy(np.sqrt(value.numpy()))  # rounded correctly, as torch does only for float64
+            return torch.from_numpy(
+                np.sqrt(value.numpy())
+            )  # rounded correctly, as torch does only for float64
 
     def settle(self, value: Tensor, low: float, high: float) -> Tensor:
         value = value.clamp(low, high).nan_to_num_(nan=0.0, posinf=high, neginf=low)

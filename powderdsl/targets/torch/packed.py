@@ -17,14 +17,14 @@ from powderdsl.system.random import MASK, base_keys
 from powderdsl.targets.job import Job, Like, PackedArrays, like_of, shape_of
 from powderdsl.targets.layout import limits, pieces
 from powderdsl.targets.torch.library import Eager, Portable
-from powderdsl.targets.torch.planes import Key, pass_source
+from powderdsl.targets.torch.planes import Key, Source, pass_source
 from powderdsl.targets.torch.program import step_keys
 from powderdsl.targets.torch.source import load_source
 
 CHUNK = 1 << 19
 """Cells of the worlds that an eager program steps together: about as many as the cache holds."""
 
-MOST_LIBRARIES = 8
+MOST_SIZES = 8
 
 Batch = tuple[Tensor, tuple[Tensor, ...]]
 """Words of all planes, int64 [planes, H, B, K], and floats of each field, see `library`."""
@@ -44,10 +44,11 @@ class PlanesState(PackedArrays):
 
 
 @dataclass
-class _Pass:
-    name: str
-    function: Callable[..., Batch]
-    inputs: tuple[Key, ...]
+class _Kernels:
+    """The operations for one size, and the functions of the passes."""
+
+    k: Portable
+    functions: list[Callable[..., Batch]]
 
 
 class PlanesProgram:
@@ -57,7 +58,7 @@ class PlanesProgram:
     """
 
     def __init__(self, program: Program, planes: Program, device: torch.device, *, fuse: bool = False):
-        self.device, self.planes = device, planes
+        self.device, self.planes, self._fuse = device, planes, fuse
         self.eager = device.type == "cpu" and sys.byteorder == "little" and not fuse
         self._pieces = pieces(program)
         names = [slot.name for slot in planes.slots if slot.type != REAL]
@@ -65,12 +66,9 @@ class PlanesProgram:
         self._fields = [slot.name for slot in planes.slots if slot.type == REAL]
         self._streams = {name: ident for name, ident, _ in planes.streams}
         self._bits = _significant_bits(planes)
-        self._passes = []
-        for i, pass_ in enumerate(planes.passes):
-            source = pass_source(planes, pass_, i)
-            function = load_source(source.text, source.name, {"inf": float("inf"), "nan": float("nan")})
-            self._passes.append(_Pass(pass_.name, function, source.inputs))
-        self._libraries: dict[tuple[int, int, int, int], Portable] = {}
+        self._sources = [pass_source(planes, pass_, i) for i, pass_ in enumerate(planes.passes)]
+        self._functions = [self._function(source) for source in self._sources]
+        self._kernels: dict[tuple[int, int, int, int], _Kernels] = {}
         self._settings: tuple[Any, list[dict[Key, Any]]] | None = None
         """The parameters of the last job, and the inputs of passes that depend on them, by chunk."""
 
@@ -85,27 +83,43 @@ class PlanesProgram:
         chunks = []
         for number, (part, settings) in enumerate(zip(parts, self._settings[1], strict=True)):
             with torch.inference_mode():
-                k = self._library(part.stop - part.start, height, width)
+                kernels = self._sized(part.stop - part.start, height, width)
                 if isinstance(job.state, PlanesState) and job.state.program is self:
                     chunk = job.state.chunks[number]
                 else:
-                    chunk = self.pack(k, {name: array[part] for name, array in job.state.items()})
+                    chunk = self.pack(kernels.k, {name: array[part] for name, array in job.state.items()})
                 seed, index, step = job.clock.seed[part], job.clock.world[part], job.clock.step[part]
-                chunks.append(self._steps(k, chunk, job, base_keys(seed, index), step, settings))
+                chunks.append(self._steps(kernels, chunk, job, base_keys(seed, index), step, settings))
         return PlanesState(self, chunks, like)
 
-    def _library(self, batch: int, height: int, width: int) -> Portable:
+    def _function(self, source: Source) -> Callable[..., Batch]:
+        return load_source(source.text, source.name, {"inf": float("inf"), "nan": float("nan")})
+
+    def _sized(self, batch: int, height: int, width: int) -> _Kernels:
         key = (batch, height, width, get_ident())  # libraries have memory that threads must not share
-        if key not in self._libraries:
-            if len(self._libraries) >= MOST_LIBRARIES:
-                self._libraries.clear()
-            self._libraries[key] = (Eager if self.eager else Portable)(batch, height, width, self.device)
-        return self._libraries[key]
+        if key not in self._kernels:
+            if len(self._kernels) >= MOST_SIZES:
+                self._kernels.clear()
+            k = (Eager if self.eager else Portable)(batch, height, width, self.device)
+            functions = self._functions
+            if self._fuse:
+                from powderdsl.targets.torch.fuse import fused  # takes seconds to import
+
+                # A function that is compiled for too many sizes is refused: each size has its own.
+                functions = [fused(self._function(source)) for source in self._sources]
+            self._kernels[key] = _Kernels(k, functions)
+        return self._kernels[key]
 
     def _steps(
-        self, k: Portable, chunk: Batch, job: Job, base: Tensor, start: Tensor, settings: Mapping[Key, Any]
+        self,
+        kernels: _Kernels,
+        chunk: Batch,
+        job: Job,
+        base: Tensor,
+        start: Tensor,
+        settings: Mapping[Key, Any],
     ) -> Batch:
-        words, fields = chunk
+        k, (words, fields) = kernels.k, chunk
         fixed = {
             **settings,
             **{
@@ -120,13 +134,15 @@ class PlanesProgram:
                 values[key] = -(step % key[1] >> key[2] & 1)[:, None]
             words, fields = self._reset(k, words, fields)
             job.tick("")
-            for pass_ in self._passes:
-                words, fields = pass_.function(k, words, fields, tuple([values[key] for key in pass_.inputs]))
+            for pass_, source, function in zip(
+                self.planes.passes, self._sources, kernels.functions, strict=True
+            ):
+                words, fields = function(k, words, fields, tuple([values[key] for key in source.inputs]))
                 job.tick(pass_.name)
         return words, fields
 
     def _keys(self, *kinds: str) -> list[Key]:
-        return [key for pass_ in self._passes for key in pass_.inputs if key[0] in kinds]
+        return [key for source in self._sources for key in source.inputs if key[0] in kinds]
 
     # Inputs of passes
 
@@ -196,7 +212,7 @@ class PlanesProgram:
     def unpack(self, chunk: Batch, name: str, like: Like) -> Tensor:
         """One array of a state, in its storage dtype."""
         words, fields = chunk
-        k = self._library(words.shape[2], words.shape[1], like["element"][1][2])
+        k = self._sized(words.shape[2], words.shape[1], like["element"][1][2]).k
         dtype = like[name][0]
         parts = []
         for piece in self._pieces[name]:
