@@ -40,7 +40,6 @@ class Portable:
         self.shape = (height, batch, self.across)
         self.everywhere, self.nowhere = self._by_row([-1]), self._by_row([0])
         self.valid = self._by_row([(1 << width) - 1])
-        self.bit = torch.arange(WORD, device=device)
         self.fixed: dict[Any, Any] = {}
         """Constants of this size that were computed before, by any key."""
 
@@ -195,18 +194,24 @@ class Portable:
 
     def bits(self, plane: Tensor) -> Tensor:
         """The flags of each cell, as integers 0 and 1."""
-        bits = (self.whole(plane)[..., None] >> self.bit) & 1  # [..., H, B, K, 64]
-        return bits.flatten(-2)[..., : self.width].movedim(-2, -1)
+        words = self.whole(plane).movedim(-1, -2)[..., None, :]  # [..., H, K, 1, B]: worlds are innermost
+        return ((words >> self._columns()) & 1).flatten(-3, -2)[..., : self.width, :]
+
+    def _columns(self) -> Tensor:
+        # Made anew: kernels compute it, where they would read a tensor that is kept.
+        return torch.arange(WORD, device=self.device)[:, None]
 
     def mask(self, plane: Tensor) -> Tensor:
-        """The flags of each cell, in the form that `choose` takes."""
-        return self.bits(plane) != 0
+        """The flags of each cell, in the form that `choose` takes: the plane, so that no mask is ever stored."""
+        return plane
 
     def pack(self, flags: Tensor) -> Tensor:
         """Flags of cells, bool, as a new plane."""
-        flags = flags.expand(*flags.shape[:-3], self.height, self.width, self.batch).to(torch.int64)
-        flags = pad(flags, (0, 0, 0, self.across * WORD - self.width)).unflatten(-2, (self.across, WORD))
-        return (flags << self.bit[:, None]).sum(-2).movedim(-2, -1)
+        bits = flags.expand(*flags.shape[:-3], self.height, self.width, self.batch).to(torch.int64)
+        if self.across == 1:
+            return (bits << self._columns()[: self.width]).sum(-2)[..., None]
+        bits = pad(bits, (0, 0, 0, self.across * WORD - self.width)).unflatten(-2, (self.across, WORD))
+        return (bits << self._columns()).sum(-2).movedim(-2, -1)
 
     def compare(self, op: str, a: Tensor | float, b: Tensor | float) -> Tensor:
         """The cells where a float equals another (`eq`), or is less (`lt`, `le`), as a new plane."""
@@ -229,7 +234,7 @@ class Portable:
 
     def choose(self, mask: Tensor, yes: Tensor | float, no: Tensor | float) -> Tensor:
         """One float where a mask holds, the other elsewhere."""
-        return torch.where(mask, self.tensor(yes), self.tensor(no))
+        return torch.where(self.bits(mask) != 0, self.tensor(yes), self.tensor(no))
 
     def increase(self, value: Tensor | float, mask: Tensor, by: Tensor | float, sign: int = 1) -> Tensor:
         """A float, increased or decreased where a mask holds."""
@@ -238,8 +243,8 @@ class Portable:
     def carry(self, value: Tensor, mask: Tensor, amount: Tensor, dy: int, dx: int) -> Tensor:
         """A float of which an amount leaves where a mask holds, and arrives where it holds at a neighbor."""
         left = self.choose(mask, value - amount, value)
-        amount = self.all_cells(amount)
-        return self.choose(self._roll(mask, dy, dx), left + self._roll(amount, dy, dx), left)
+        arrived = left + self.neighbor(amount, dy, dx)
+        return self.choose(self.shift(mask, dy, dx), arrived, left)
 
     increase_, carry_ = increase, carry
     """The same, which may overwrite the first argument."""
