@@ -131,6 +131,9 @@ _TEXT = ("syntax",)
 _TORCH = (
     "targets.tensor_kind",
     "targets.torch.program",
+    "targets.torch.packed",
+    "targets.torch.library",
+    "targets.torch.fuse",
     "targets.arrays.program",
     "targets.cpp.program",
     "targets.cuda.program",

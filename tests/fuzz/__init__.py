@@ -10,6 +10,9 @@ EMULATED = "cuda-emulated"
 TARGETS = tuple(name for name in BACKENDS if name not in ("auto", "cuda", "reference", "torch-fused"))
 """What runs on every machine: `auto` runs one of these, and the reference is what they are compared with."""
 
+PORTABLE = "torch-portable"
+"""The functions of `torch` with the library for other devices and for compilation, on the CPU."""
+
 COMPARED = (*TARGETS, EMULATED)
 """Every target but CUDA on a GPU."""
 

@@ -19,7 +19,7 @@ from powderdsl.model.types import Ruleset
 from powderdsl.simulation.simulator import compile as compile_ruleset
 from powderdsl.targets.cpp.build import Building, building
 from powderdsl.testing.generators.cases import Choices, Start, random_start
-from tests.fuzz import EMULATED, STARTS_AT_ONCE
+from tests.fuzz import EMULATED, PORTABLE, STARTS_AT_ONCE
 from tests.fuzz.cases import Case, fitted
 from tests.fuzz.compare import find_difference
 from tests.fuzz.cuda_emulation import EmulatedSimulator
@@ -178,8 +178,18 @@ def _simulator(text: str, backend: str, how: Building) -> Simulator:
 def _compiled(ruleset: Ruleset, backend: str, how: Building, threads: int) -> Simulator:
     if backend == EMULATED:
         return _emulated(ruleset, how.folder, order=threads % 2)
+    if backend == PORTABLE:
+        return portable(compile_ruleset(ruleset, backend="torch"))
     with building(how):
         return compile_ruleset(ruleset, backend=backend, threads=threads if backend == "native" else 1)
+
+
+def portable(simulator: Simulator) -> Simulator:
+    """A simulator of the backend `torch` that runs as on other devices than CPUs."""
+    program = simulator._program.whole
+    for part in getattr(program, "parts", [program]):
+        part.eager = False
+    return simulator
 
 
 def _emulated(ruleset: Ruleset, folder: Path | None, order: int) -> Simulator:

@@ -10,7 +10,7 @@ import torch
 import torch._dynamo.exc
 
 from powderdsl.diagnostics import CompileError
-from powderdsl.system.cache import compiled_folder
+from powderdsl.system.writing import cache_folder
 from powderdsl.targets.job import unavailable
 
 SETTINGS: dict[str, Any] = {
@@ -31,7 +31,7 @@ def fused(function: Callable[..., Any]) -> Callable[..., Any]:
 
     Raises CompileError (PD701) on that call if it cannot be compiled.
     """
-    os.environ.setdefault("TORCHINDUCTOR_CACHE_DIR", str(compiled_folder() / "inductor"))
+    os.environ.setdefault("TORCHINDUCTOR_CACHE_DIR", str(cache_folder("inductor")))
     compiled = torch.compile(function, fullgraph=True, dynamic=False, options=SETTINGS)
 
     def run(*args: Any) -> Any:

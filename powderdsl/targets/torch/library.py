@@ -21,6 +21,7 @@ from torch.nn.functional import pad
 
 from powderdsl.ir.ops import SNAP
 from powderdsl.schedule.types import Leftover
+from powderdsl.system.random import MASK
 from powderdsl.targets.tensor_kind import WORD, word_count
 
 _ALL = (1 << WORD) - 1
@@ -149,6 +150,28 @@ class Portable:
         return arrived ^ (movers & (arrived ^ self.shift(planes, dy, dx)))
 
     # Draws: planes [bits, H, B, K] of the inverted bits of a number of each cell, highest first
+
+    def draws(self, keys: Tensor, bits: int) -> Tensor:
+        """A stream's draws in a step, from its keys, int32 [2, B]. As `program.words`, in int32, which wraps as the hash does."""
+        h = self._numbers(bits) + keys[0][:, None]
+        h.bitwise_xor_((h >> 16).bitwise_and_(0xFFFF)).mul_(0x7FEB352D)
+        h.bitwise_xor_((h >> 15).bitwise_and_(0x1FFFF))
+        h.add_(keys[1][:, None]).mul_(0x846CA68B - (1 << 32))
+        return self._joined(h.bitwise_xor_((h >> 16).bitwise_and_(0xFFFF)).bitwise_not_())
+
+    def _numbers(self, bits: int) -> Tensor:
+        """What enters the hash for each bit and half of a word: int32 [bits, H, 1, 2 K]."""
+        halves = -(-self.width // 32)
+        half = torch.arange(2 * self.across, device=self.device).clamp(
+            max=halves - 1
+        )  # the last half may be unused
+        row = torch.arange(self.height, device=self.device)[:, None, None] * halves
+        plane = torch.arange(bits, device=self.device)[:, None, None, None]
+        return (((row + half) * 32 + plane) * 0x9E3779B1).to(torch.int32)
+
+    def _joined(self, halves: Tensor) -> Tensor:
+        """Words from their halves."""
+        return (halves[..., ::2].to(torch.int64) & MASK) | (halves[..., 1::2].to(torch.int64) << 32)
 
     def chance(self, draws: Sequence[Tensor], limit: int, bits: int) -> Tensor:
         """The cells whose number of some bits is below a limit."""
@@ -314,6 +337,15 @@ class Eager(Portable):
                 rest[i].copy_(planes[i])
         arrived = self.shift(planes & movers, -dy, -dx)
         return rest.bitwise_and_(targets.bitwise_not_()).bitwise_or_(arrived)
+
+    def _numbers(self, bits: int) -> Tensor:
+        if ("numbers", bits) not in self.fixed:
+            self.fixed["numbers", bits] = super()._numbers(bits)
+        numbers: Tensor = self.fixed["numbers", bits]
+        return numbers
+
+    def _joined(self, halves: Tensor) -> Tensor:
+        return halves.view(torch.int64)
 
     def chance(self, draws: Sequence[Tensor], limit: int, bits: int) -> Tensor:
         if not 0 < limit < 1 << bits or limit & (limit - 1) == 0:

@@ -6,14 +6,14 @@ import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from threading import get_ident
+from types import FunctionType
 from typing import Any
 
 import torch
 from torch import Tensor
-from torch.nn.functional import pad
 
 from powderdsl.ir.ops import REAL, Program, nodes_of
-from powderdsl.system.random import MASK, base_keys
+from powderdsl.system.random import base_keys
 from powderdsl.targets.job import Job, Like, PackedArrays, like_of, shape_of
 from powderdsl.targets.layout import limits, pieces
 from powderdsl.targets.torch.library import Eager, Portable
@@ -48,6 +48,7 @@ class _Kernels:
     """The operations for one size, and the functions of the passes."""
 
     k: Portable
+    draw: Callable[..., tuple[Tensor, ...]]
     functions: list[Callable[..., Batch]]
 
 
@@ -64,8 +65,9 @@ class PlanesProgram:
         names = [slot.name for slot in planes.slots if slot.type != REAL]
         self._number = {name: i for i, name in enumerate(names)}
         self._fields = [slot.name for slot in planes.slots if slot.type == REAL]
-        self._streams = {name: ident for name, ident, _ in planes.streams}
         self._bits = _significant_bits(planes)
+        idents = [ident for name, ident, _ in planes.streams if name in self._bits]
+        self._idents = torch.tensor(idents, dtype=torch.int64, device=device)
         self._sources = [pass_source(planes, pass_, i) for i, pass_ in enumerate(planes.passes)]
         self._functions = [self._function(source) for source in self._sources]
         self._kernels: dict[tuple[int, int, int, int], _Kernels] = {}
@@ -101,13 +103,14 @@ class PlanesProgram:
             if len(self._kernels) >= MOST_SIZES:
                 self._kernels.clear()
             k = (Eager if self.eager else Portable)(batch, height, width, self.device)
-            functions = self._functions
+            draw, functions = _draw, self._functions
             if self._fuse:
                 from powderdsl.targets.torch.fuse import fused  # takes seconds to import
 
                 # A function that is compiled for too many sizes is refused: each size has its own.
                 functions = [fused(self._function(source)) for source in self._sources]
-            self._kernels[key] = _Kernels(k, functions)
+                draw = fused(FunctionType(_draw.__code__.replace(), globals()))
+            self._kernels[key] = _Kernels(k, draw, functions)
         return self._kernels[key]
 
     def _steps(
@@ -129,7 +132,12 @@ class PlanesProgram:
         }
         for i in range(job.steps):
             step = start + i
-            values = {**fixed, **self._draws(k, base, step)}
+            drawn = (
+                kernels.draw(k, base, step, self._idents, tuple(self._bits.values())) if self._bits else ()
+            )
+            values = dict(fixed)
+            for stream, planes in zip(self._bits, drawn, strict=True):
+                values["draws", stream] = planes.unbind() if self.eager else planes
             for key in self._keys("step"):
                 values[key] = -(step % key[1] >> key[2] & 1)[:, None]
             words, fields = self._reset(k, words, fields)
@@ -170,15 +178,6 @@ class PlanesProgram:
             else:
                 values[key] = tuple([-(number >> i & 1)[:, None] for i in range(threshold.bits, -1, -1)])
         return values
-
-    def _draws(self, k: Portable, base: Tensor, step: Tensor) -> dict[Key, Any]:
-        """The numbers of each stream in a step, as planes."""
-        streams = [*dict.fromkeys(self._keys("draws"))]
-        if not streams:
-            return {}
-        idents = torch.tensor([self._streams[name] for _, name in streams], device=self.device)
-        keys = step_keys(base, step, idents).to(torch.int32)
-        return {key: drawn_planes(k, keys[i], self._bits[key[1]]).unbind() for i, key in enumerate(streams)}
 
     def _reset(self, k: Portable, words: Tensor, fields: tuple[Tensor, ...]) -> Batch:
         resets = [slot for slot in self.planes.slots if slot.resets]
@@ -231,28 +230,10 @@ class PlanesProgram:
         return whole.to(dtype).contiguous()
 
 
-def drawn_planes(k: Portable, keys: Tensor, bits: int) -> Tensor:
-    """The inverted bits of a stream's draws, highest first: int64 [bits, H, B, K].
-
-    `keys` is int32 [2, B]. As `program.words`, in int32, which wraps as the hash does.
-    """
-    across = -(-k.width // 32)
-    if ("numbers", bits) not in k.fixed:
-        number = (
-            torch.arange(k.height * across, dtype=torch.int64, device=k.device).view(k.height, 1, across) * 32
-        )
-        plane = torch.arange(bits, dtype=torch.int64, device=k.device).view(-1, 1, 1, 1)
-        k.fixed["numbers", bits] = (((number + plane) * 0x9E3779B1) & MASK).to(torch.int32)
-    h = k.fixed["numbers", bits] + keys[0][:, None]
-    h = (h ^ ((h >> 16) & 0xFFFF)) * 0x7FEB352D
-    h = h ^ ((h >> 15) & 0x1FFFF)
-    h = (h + keys[1][:, None]) * (0x846CA68B - (1 << 32))
-    h = ~(h ^ ((h >> 16) & 0xFFFF))
-    if across % 2:
-        h = pad(h, (0, 1))
-    if sys.byteorder == "little" and k.device.type == "cpu":
-        return h.view(torch.int64)
-    return (h[..., ::2].to(torch.int64) & MASK) | (h[..., 1::2].to(torch.int64) << 32)
+def _draw(k: Portable, base: Tensor, step: Tensor, idents: Tensor, bits: Sequence[int]) -> tuple[Tensor, ...]:
+    """The draws of each stream in a step, from its number and the bits it needs."""
+    keys = step_keys(base, step, idents).to(torch.int32)
+    return tuple([k.draws(keys[i], count) for i, count in enumerate(bits)])
 
 
 def _significant_bits(planes: Program) -> dict[str, int]:
@@ -265,4 +246,4 @@ def _significant_bits(planes: Program) -> dict[str, int]:
                 if limit and limit[0]:
                     own -= (limit[0] & -limit[0]).bit_length() - 1
                 bits[stream] = max(bits.get(stream, 1), own)
-    return bits
+    return {name: bits[name] for name, _, _ in planes.streams if name in bits}
