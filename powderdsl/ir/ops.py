@@ -193,7 +193,7 @@ class Node:
 
     op: str
     type: Type
-    args: tuple[Node, ...]
+    args: tuple[Node, ...] = field(repr=False)
     attr: Any
     index: int
     places: tuple[str, ...] = field(default=(), repr=False)

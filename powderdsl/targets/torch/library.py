@@ -52,6 +52,16 @@ class Portable:
         """Planes as one tensor [planes, H, B, K]."""
         return torch.stack([self.whole(plane) for plane in planes])
 
+    def replaced(self, words: Tensor, numbers: Sequence[int], planes: Sequence[Tensor]) -> Tensor:
+        """The planes of all slots, some of them new."""
+        new = dict(zip(numbers, planes, strict=True))
+        parts, at = [], 0
+        for i in (*sorted(new), len(words)):
+            parts += [words[at:i]] if at < i else []
+            parts += [self.whole(new[i])[None]] if i in new else []
+            at = i + 1
+        return torch.cat(parts)
+
     # Neighbors
 
     def rows(self, plane: Tensor, dy: int) -> Tensor:
@@ -152,26 +162,28 @@ class Portable:
     # Draws: planes [bits, H, B, K] of the inverted bits of a number of each cell, highest first
 
     def draws(self, keys: Tensor, bits: int) -> Tensor:
-        """A stream's draws in a step, from its keys, int32 [2, B]. As `program.words`, in int32, which wraps as the hash does."""
-        h = self._numbers(bits) + keys[0][:, None]
+        """A stream's draws in a step, from its keys, int32 [2, B]."""
+        lower, upper = (self._hashed(self._numbers(bits, slice(i, None, 2)), keys) for i in (0, 1))
+        return (lower.to(torch.int64) & MASK) | (upper.to(torch.int64) << 32)
+
+    def _numbers(self, bits: int, halves: slice) -> Tensor:
+        """What enters the hash for each bit and some halves of words: int32 [bits, H, 1, halves]."""
+        count = -(-self.width // 32)  # the last word may lack a half
+        half = torch.arange(2 * self.across, dtype=torch.int32, device=self.device)[halves].clamp(
+            max=count - 1
+        )
+        row = torch.arange(self.height, dtype=torch.int32, device=self.device)[:, None, None] * count
+        plane = torch.arange(bits, dtype=torch.int32, device=self.device)[:, None, None, None]
+        return ((row + half) * 32 + plane) * (0x9E3779B1 - (1 << 32))
+
+    @staticmethod
+    def _hashed(numbers: Tensor, keys: Tensor) -> Tensor:
+        """As `program.words`, in int32, which wraps as the hash does; inverted."""
+        h = numbers + keys[0][:, None]
         h.bitwise_xor_((h >> 16).bitwise_and_(0xFFFF)).mul_(0x7FEB352D)
         h.bitwise_xor_((h >> 15).bitwise_and_(0x1FFFF))
         h.add_(keys[1][:, None]).mul_(0x846CA68B - (1 << 32))
-        return self._joined(h.bitwise_xor_((h >> 16).bitwise_and_(0xFFFF)).bitwise_not_())
-
-    def _numbers(self, bits: int) -> Tensor:
-        """What enters the hash for each bit and half of a word: int32 [bits, H, 1, 2 K]."""
-        halves = -(-self.width // 32)
-        half = torch.arange(2 * self.across, device=self.device).clamp(
-            max=halves - 1
-        )  # the last half may be unused
-        row = torch.arange(self.height, device=self.device)[:, None, None] * halves
-        plane = torch.arange(bits, device=self.device)[:, None, None, None]
-        return (((row + half) * 32 + plane) * 0x9E3779B1).to(torch.int32)
-
-    def _joined(self, halves: Tensor) -> Tensor:
-        """Words from their halves."""
-        return (halves[..., ::2].to(torch.int64) & MASK) | (halves[..., 1::2].to(torch.int64) << 32)
+        return h.bitwise_xor_((h >> 16).bitwise_and_(0xFFFF)).bitwise_not_()
 
     def chance(self, draws: Sequence[Tensor], limit: int, bits: int) -> Tensor:
         """The cells whose number of some bits is below a limit."""
@@ -310,6 +322,12 @@ def _pattern(value: float) -> int:
 class Eager(Portable):
     """The operations for CPUs, which are little endian."""
 
+    def replaced(self, words: Tensor, numbers: Sequence[int], planes: Sequence[Tensor]) -> Tensor:
+        words = words.clone()
+        for i, plane in zip(numbers, planes, strict=True):
+            words[i] = plane
+        return words
+
     def columns(self, plane: Tensor, dx: int) -> Tensor:
         by = dx % self.width
         if self.across > 1 or not by:
@@ -338,14 +356,10 @@ class Eager(Portable):
         arrived = self.shift(planes & movers, -dy, -dx)
         return rest.bitwise_and_(targets.bitwise_not_()).bitwise_or_(arrived)
 
-    def _numbers(self, bits: int) -> Tensor:
+    def draws(self, keys: Tensor, bits: int) -> Tensor:
         if ("numbers", bits) not in self.fixed:
-            self.fixed["numbers", bits] = super()._numbers(bits)
-        numbers: Tensor = self.fixed["numbers", bits]
-        return numbers
-
-    def _joined(self, halves: Tensor) -> Tensor:
-        return halves.view(torch.int64)
+            self.fixed["numbers", bits] = self._numbers(bits, slice(None))
+        return self._hashed(self.fixed["numbers", bits], keys).view(torch.int64)
 
     def chance(self, draws: Sequence[Tensor], limit: int, bits: int) -> Tensor:
         if not 0 < limit < 1 << bits or limit & (limit - 1) == 0:

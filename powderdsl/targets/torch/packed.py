@@ -60,6 +60,8 @@ class PlanesProgram:
 
     def __init__(self, program: Program, planes: Program, device: torch.device, *, fuse: bool = False):
         self.device, self.planes, self._fuse = device, planes, fuse
+        # glibc maps large blocks anew for each tensor until it has freed a larger one, and clearing pages takes half the time.
+        torch.empty(31 << 20, dtype=torch.uint8)
         self.eager = device.type == "cpu" and sys.byteorder == "little" and not fuse
         self._pieces = pieces(program)
         names = [slot.name for slot in planes.slots if slot.type != REAL]

@@ -332,23 +332,23 @@ class _Writer:
         contents = self.block([node.args[0] for node in group])
         mask = self.of(movers)
         args = [contents.name, mask]
+        members: list[Node | None] = [*group]
+        if contents.planes != [node.args[0] for node in group]:  # a tensor that has other planes too
+            by_content = {node.args[0]: node for node in group}
+            members = [by_content.get(plane) if plane else None for plane in contents.planes]
         if simple and op == "swap":
             text = f"k.swap({contents.name}, {mask}, {dy}, {dx})"
         elif simple:
-            left = {node.args[0]: leftover(node.args[0], node.args[2], movers) for node in group}
-            kinds = [(plane and left.get(plane)) or "same" for plane in contents.planes]
+            kinds = [leftover(node.args[0], node.args[2], movers) if node else "same" for node in members]
             text = f"k.leave({contents.name}, {mask}, {dy}, {dx}, {self.input('left', *kinds)})"
         else:
-            if contents.planes != [node.args[0] for node in group]:
-                contents = self.stack([node.args[0] for node in group])
+            if members != group:
+                contents, members = self.stack([node.args[0] for node in group]), [*group]
             rest = self.stack([node.args[2] for node in group])
             args = [contents.name, mask, rest.name]
             text = f"k.{'exchange' if op == 'swap' else 'arrive'}({contents.name}, {mask}, {rest.name}, {dy}, {dx})"
-        planes: dict[Node, Node] = {node.args[0]: node for node in group}
-        moved = _Block(
-            self.name(text, "b", args), [planes.get(plane) if plane else None for plane in contents.planes]
-        )
-        for i, plane in enumerate(moved.planes):
+        moved = _Block(self.name(text, "b", args), members)
+        for i, plane in enumerate(members):
             if plane is not None:
                 self.blocks[plane] = (moved, i)
 
@@ -372,8 +372,10 @@ class _Writer:
         if all(place is not None and place[0] is home and place[1] == i for i, place in enumerate(places)):
             words = home.name if home else "words"
         else:
-            names = [self.of(node) if node else self.name(f"words[{i}]") for i, node in enumerate(outputs)]
-            words = self.name(f"k.stack(({', '.join(names)},))", "b", names)
+            changed = {i: self.of(node) for i, node in enumerate(outputs) if node}
+            names = "".join(f"{name}, " for name in changed.values())
+            text = f"k.replaced(words, {tuple(changed)}, ({names}))" if changed else "words"
+            words = self.name(text, "b", [*changed.values()])
         floats = [
             self.name(f"k.all_cells({self.of(node)})", "f", (self.of(node),)) if node else f"fields[{i}]"
             for i, node in enumerate(map(self.outputs.get, self.fields))
