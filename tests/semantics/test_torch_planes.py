@@ -12,8 +12,12 @@ import pytest
 
 from powderdsl import CompileError, load
 from powderdsl.compiler import segments_of
+from powderdsl.ir.ops import FLAG, Graph, PassGraph, Program, SlotType
 from powderdsl.simulation.simulator import compile as compile_ruleset
+from powderdsl.targets.job import Clock, Job
+from powderdsl.targets.torch.packed import PlanesProgram
 from powderdsl.targets.torch.planes import pass_source
+from powderdsl.targets.torch.program import TorchProgram
 from tests.compilers import skip_without_compiler
 from tests.fuzz import PORTABLE
 from tests.fuzz.compare import assert_same_worlds, find_difference
@@ -113,6 +117,27 @@ def test_planes_that_move_alike_move_together() -> None:
     assert len(re.findall(r"k\.swap\(", texts["gravity"])) == 4
     assert len(re.findall(r"k\.leave\(", texts["wind"])) == 16
     assert "torch.where" not in "".join(texts.values())
+
+
+def test_equal_planes_may_leave_other_things_behind(torch: Any) -> None:
+    graph = Graph()
+    content, movers = graph.input("element", FLAG), graph.input("movers", FLAG)
+    rests = [content, graph.and_(content, graph.not_(movers)), graph.or_(content, movers), movers]
+    moved = [graph.derive("arrive", content, movers, rest, attr=(0, 1)) for rest in rests]
+    names = ("a", "b", "c", "d")
+    slots = [SlotType(name, FLAG, 0, resets=False) for name in ("element", "movers", *names)]
+    pass_ = PassGraph("moving", "", (), tuple(zip(names, moved, strict=True)))
+    program, cpu = Program("moving", tuple(slots), (), (), (pass_,)), torch.device("cpu")
+    generator = torch.Generator().manual_seed(0)
+    state = {slot.name: torch.rand(2, 5, 70, generator=generator) < 0.5 for slot in slots}
+    clock = Clock(*torch.zeros(3, 2, dtype=torch.int64))
+    job = Job(state, clock, 1, {}, {}, None)
+    eager = PlanesProgram(program, program, cpu)
+    other = PlanesProgram(program, program, cpu)
+    other.eager = False
+    want = TorchProgram(program, cpu).run(job)
+    for planes in (eager, other):
+        assert find_difference(want, planes.run(job)) is None
 
 
 @pytest.fixture
