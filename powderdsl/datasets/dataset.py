@@ -85,8 +85,7 @@ def write_shard(
 ) -> ShardRow:
     """Write a shard from arrays in parts, which are concatenated. Equal arrays make equal files.
 
-    Raises:
-        CompileError: PD613 if the place cannot be written, or the disk is full.
+    Raises CompileError (PD613) if the place cannot be written, or the disk is full.
     """
     path = folder / shard_file(number)
     arrays: dict[str, Array | Parts | str] = {}
@@ -133,8 +132,7 @@ def is_whole(folder: Path, row: ShardRow) -> bool:
 def open_shard(folder: Path, recipe: Recipe, row: ShardRow) -> Shard:
     """A shard, after checking every byte of it.
 
-    Raises:
-        CompileError: PD630, naming the shard and what is wrong with it.
+    Raises CompileError (PD630), naming the shard and what is wrong with it.
     """
     path = folder / row.file
     with _damage(path):
@@ -148,8 +146,7 @@ def open_shard(folder: Path, recipe: Recipe, row: ShardRow) -> Shard:
 def read_episodes(folder: Path, recipe: Recipe, row: ShardRow) -> tuple[Array, Array]:
     """The arrays `length` and `world` of a shard, whose other bytes are neither read nor checked.
 
-    Raises:
-        CompileError: PD630, as `open_shard`.
+    Raises as `open_shard`.
     """
     path = folder / row.file
     with _damage(path):
@@ -314,11 +311,7 @@ class Dataset:
             raise failure("PD631", f"{self.folder} does not fit {whose}", notes=notes)
 
     def check(self) -> None:
-        """Read every byte of every shard.
-
-        Raises:
-            CompileError: PD630, one for each shard that is damaged.
-        """
+        """Read every byte of every shard. Raises CompileError (PD630), with each shard that is damaged."""
         errors: list[Diagnostic] = []
         for number, row in enumerate(self.manifest.shards):
             self._shards.pop(number, None)

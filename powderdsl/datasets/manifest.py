@@ -131,11 +131,7 @@ def write_manifest(folder: Path, manifest: Manifest) -> None:
 
 
 def read_manifest(folder: Path) -> Manifest:
-    """The manifest of a folder, every value checked.
-
-    Raises:
-        CompileError: PD630, with all that is wrong.
-    """
+    """The manifest of a folder, every value checked. Raises CompileError (PD630), with all that is wrong."""
     path = folder / FILE
     try:
         data = parse_json(read_bytes(path, MAX_BYTES), MAX_VALUES)
@@ -175,8 +171,7 @@ def _checked(path: Path, data: Any) -> Manifest:
 def check_place(folder: Path) -> None:
     """Check, before long work, that a dataset can be recorded in a folder.
 
-    Raises:
-        CompileError: PD613: the folder around it is not there; PD630: it holds something else.
+    Raises CompileError: PD613 if the folder around it is not there, PD630 if it holds something else.
     """
     if not folder.is_dir():
         reason = "it is a file" if folder.exists() else f"there is no folder {folder.parent}"
@@ -234,8 +229,7 @@ def recipe_of(
 ) -> Recipe:
     """Describe an environment's task, split, rules and observations for a manifest. `shard` as in `record`.
 
-    Raises:
-        ValueError: a value out of range, or a shard may become too large.
+    Raises ValueError for a value out of range, or if a shard may become too large.
     """
     task, ruleset = env.task, env.task.ruleset
     recipe = Recipe(

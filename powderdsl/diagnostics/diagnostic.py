@@ -239,8 +239,7 @@ class Reporter:
     ) -> None:
         """Add a diagnostic. The code's row in the table decides whether it is an error, a warning or a note.
 
-        Raises:
-            CompileError: with everything so far, when there are MAX_ERRORS errors.
+        Raises CompileError with everything so far, when there are MAX_ERRORS errors.
         """
         if span is not None and span.end <= span.start:
             span = Span(span.source, span.start, span.start + 1)  # something to underline

@@ -61,8 +61,8 @@ class ActionForm:
     def decode(self, actions: Any) -> Tensor:
         """The five numbers of actions: int64 [B, 5], from integers [B] (``discrete``) or [B, k].
 
-        Raises:
-            TypeError: they are not integers. ValueError: a wrong shape, or a number out of range, with its index.
+        Raises TypeError if they are not integers, ValueError for a wrong shape, or a number out of range, with its
+        index.
         """
         if self.kind == "discrete":
             values = integer_tensor("actions", actions)
@@ -79,8 +79,7 @@ class ActionForm:
     def encode(self, numbers: Any) -> Tensor:
         """The actions in this form, int64 [B] or [B, k], that do the same as five numbers each, [B, 5].
 
-        Raises:
-            TypeError, ValueError: as `decode`.
+        Raises as `decode`.
         """
         full = check_numbers(numbers, self.full_nvec, ACTION).to(self.table.device)
         if self.kind != "discrete":
@@ -93,8 +92,7 @@ class ActionForm:
 def action_form(kind: str, agent: Agent, device: torch.device) -> ActionForm:
     """The form of a kind (one of KINDS) for an agent.
 
-    Raises:
-        ValueError: an unknown kind, or more than MAX_ACTIONS discrete actions.
+    Raises ValueError for an unknown kind, or more than MAX_ACTIONS discrete actions.
     """
     check_choice("actions", kind, KINDS)
     rows, columns = agent.bins

@@ -140,8 +140,7 @@ class Features(BaseFeaturesExtractor):
 def patches_of(env: TensorEnv, patches: tuple[int, int], frames: int = 1) -> Any:
     """A module from stacked observations of an environment to patches [B, its `channels`, rows, columns].
 
-    Raises:
-        ValueError: for observations that are pictures.
+    Raises ValueError for observations that are pictures.
     """
     _refuse_pictures(env)
     count, size = len(env.observation.channels), env.task.size
@@ -181,9 +180,7 @@ def small_policy(env: TensorEnv, features_dim: int = 128, frames: int = 1) -> di
     """`policy_kwargs` of ``CnnPolicy`` for the observations of an environment: a small network for processors.
 
     It counts what lies in each patch of cells, and runs convolutions on the counts. `frames`: see `paper_policy`.
-
-    Raises:
-        ValueError: for observations that are pictures.
+    Raises ValueError for observations that are pictures.
     """
     rows, columns = (
         min(side, max(FEWEST, min(MOST, count)))

@@ -398,8 +398,7 @@ class TensorEnv:
 def seeds_of(seed: Any, count: int) -> list[int | None]:
     """The seeds of environments: s gives environment i the seed s + i; a list gives each its own, or None.
 
-    Raises:
-        TypeError, ValueError: it is neither, or has another length, or a seed is out of range.
+    Raises TypeError or ValueError if it is neither, or has another length, or a seed is out of range.
     """
     if seed is None:
         return [None] * count

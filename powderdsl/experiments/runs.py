@@ -418,8 +418,8 @@ def check_palette(
 ) -> None:
     """Compare the slots of a run's network with the elements of some rules, qualified names by id.
 
-    Raises:
-        CompileError: PD623, with every element that has no slot, or whose slot is another's. `helps` are for the first.
+    Raises CompileError (PD623), with every element that has no slot, or whose slot is another's. `helps` are for the
+    first.
     """
     why, lacking = [], 0
     for number, name in elements.items():

@@ -412,8 +412,7 @@ class Episodes:
     def observations(self) -> Tensor:
         """uint8 [B, H, W, 6]: the worlds' pictures, then the action frames. It is never overwritten.
 
-        Raises:
-            ResetNeeded: before the first episode.
+        Raises ResetNeeded before the first episode.
         """
         assert self._world
         return self._shown.clone()
@@ -426,8 +425,7 @@ class Episodes:
 def task_of(level: Level, options: Mapping[str, Any]) -> int | GoalTask | None:
     """The task that options of `reset` name: a number from 1, a custom task, or None.
 
-    Raises:
-        TypeError, ValueError: they name none that the level has.
+    Raises TypeError or ValueError if they name none that the level has.
     """
     number, info = options.get("task_id"), options.get("task_info")
     if info is not None:

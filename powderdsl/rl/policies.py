@@ -289,8 +289,7 @@ def _own_env(run: RunFolder, config: TrainConfig, env: TensorEnv) -> TensorEnv:
 def task_of(run: RunFolder, packs: Sequence[str] = ()) -> Task:
     """The task of a run, with the ids that its network knows. `packs` are added to its rules.
 
-    Raises:
-        CompileError: PD640 if its settings are damaged; what `load_task` raises.
+    Raises CompileError: PD640 if its settings are damaged; what `load_task` raises.
     """
     config = config_of(run)
     return load_task(

@@ -41,10 +41,8 @@ def array_kind(backend: str, device: Any, tensors: bool) -> ArrayKind:
     """The arrays of a simulator: torch tensors, or `powderdsl.arrays` where torch is missing or not wanted.
 
     `tensors`: use torch wherever it is installed, not only where the backend or the device needs it. Without, `auto` is
-    WebAssembly on the CPU.
-
-    Raises:
-        CompileError: PD701 if the backend or the device is unknown, or needs torch, which is missing.
+    WebAssembly on the CPU. Raises CompileError (PD701) if the backend or the device is unknown, or needs torch, which
+    is missing.
     """
     if backend not in BACKENDS:
         raise failure("PD701", f"no backend `{backend}`", helps=("backends: " + ", ".join(BACKENDS),))
@@ -100,10 +98,7 @@ def make_program(
     | tensors | others    | the backend            | torch-cells   | torch-cells |
 
     `auto` is wasm and later native code on the CPU; on other devices cuda, or torch where that is missing; with plain
-    arrays wasm, or the oracle where that is missing.
-
-    Raises:
-        CompileError: PD701 if the backend is not available.
+    arrays wasm, or the oracle where that is missing. Raises CompileError (PD701) if the backend is not available.
     """
     device, plain = kind.device, kind.xp.__name__ != "torch"
     problem = _wasm_problem() if backend in ("auto", "wasm") else ""

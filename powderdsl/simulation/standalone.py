@@ -42,11 +42,8 @@ _CELLS = {
 def standalone_module(ruleset: Ruleset, size: tuple[int, int], memo: Memo | None = None) -> bytes:
     """The bytes of a module that is a world of `size` (rows, columns), as described in `targets.wasm.standalone`.
 
-    `memo` is as in `powderdsl.compile`.
-
-    Raises:
-        CompileError: PD607 if the world is empty or too large, or its sides do not fit the rules, PD702 if the rules have a pass
-            that WebAssembly cannot run.
+    `memo` is as in `powderdsl.compile`. Raises CompileError: PD607 if the world is empty or too large, or its sides do
+    not fit the rules, PD702 if the rules have a pass that WebAssembly cannot run.
     """
     if not fits(ruleset, size):
         raise failure("PD607", size_problem(ruleset, size))

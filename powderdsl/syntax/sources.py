@@ -55,8 +55,7 @@ def shipped_names(folder: str) -> list[str]:
 def find_source(text: str, folder: str, noun: str, reporter: Reporter) -> Source:
     """A file of a shipped folder by name, or a file by its path. `noun` says what it is, for messages.
 
-    Raises:
-        CompileError: PD801 for an unknown name, PD101 or PD102 for what cannot be read.
+    Raises CompileError: PD801 for an unknown name, PD101 or PD102 for what cannot be read.
     """
     known = shipped_names(folder)
     if text not in known and not text.lower().endswith((".yaml", ".yml")):

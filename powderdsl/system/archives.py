@@ -124,8 +124,7 @@ def _header_bytes(descr: str, shape: tuple[int, ...]) -> bytes:
 def open_archive(path: Path) -> Iterator[Archive]:
     """The headers of an .npz. No pickles, no structured arrays.
 
-    Raises:
-        OSError: the file cannot be opened. BadArchive: it is damaged, or is not an .npz.
+    Raises OSError if the file cannot be opened, BadArchive if it is damaged, or is not an .npz.
     """
     with open_regular(path) as file:
         with _as_bad_archive():

@@ -15,11 +15,8 @@ def fingerprint(model: object, *, whole: bool = False) -> str:
     """64 hexadecimal digits for a value made of frozen dataclasses, tuples, frozen sets, numbers and text.
 
     Fields that take no part in comparisons, such as places in files, take none here, nor do those with `UNMEANING` as
-    metadata; if `whole` is true, all do. A field at its default counts as absent, so that new fields change no fingerprint. The names of classes and
-    fields are part of it.
-
-    Raises:
-        TypeError: something else was found.
+    metadata; if `whole` is true, all do. A field at its default counts as absent, so that new fields change no
+    fingerprint. The names of classes and fields are part of it. Raises TypeError for anything else.
     """
     known: dict[int, tuple[object, str]] = {}  # shared parts are many: once each
     return _digest(model, known, whole)

@@ -19,8 +19,7 @@ from typing import Any
 def open_regular(path: str | Path) -> BufferedReader:
     """Open a regular file for reading, also through links.
 
-    Raises:
-        OSError: it cannot be opened, or is no regular file.
+    Raises OSError if it cannot be opened, or is no regular file.
     """
     check_regular(path)
     return open(path, "rb")
@@ -29,8 +28,7 @@ def open_regular(path: str | Path) -> BufferedReader:
 def check_regular(path: str | Path) -> None:
     """Refuse a folder, and pipes and devices, which may have no end.
 
-    Raises:
-        OSError: there is no regular file; `strerror` says why.
+    Raises OSError if there is no regular file; `strerror` says why.
     """
     name = os.fspath(path)
     if "\0" in name:
@@ -42,8 +40,7 @@ def check_regular(path: str | Path) -> None:
 def read_bytes(path: str | Path, limit: int) -> bytes:
     """The contents of a regular file of at most `limit` bytes.
 
-    Raises:
-        OSError: as `open_regular`; with the number EFBIG if it has more bytes, of which no more than one is read.
+    Raises OSError: as `open_regular`; with the number EFBIG if it has more bytes, of which no more than one is read.
     """
     with open_regular(path) as file:
         data = file.read(limit + 1)
@@ -86,8 +83,7 @@ def read_json(path: str | Path, limit: int = 1 << 22) -> Any:
 def inside(folder: str | Path, name: str) -> Path:
     """The path of a file that a text names: relative to `folder`, and in it or below, also once links are followed.
 
-    Raises:
-        ValueError: the path leads elsewhere; the text says why.
+    Raises ValueError if the path leads elsewhere; the text says why.
     """
     if any(ord(char) < 32 or ord(char) == 127 for char in name):
         raise ValueError("it has control characters")
@@ -121,8 +117,7 @@ def is_path(word: str) -> bool:
 def check_links(folder: str | Path) -> None:
     """Refuse a folder with links that lead out of it: writes to them would land elsewhere.
 
-    Raises:
-        OSError: there is such a link, or the folder cannot be listed; `filename` says which.
+    Raises OSError if there is such a link, or the folder cannot be listed; `filename` says which.
     """
     top, waiting = os.path.realpath(folder), [os.fspath(folder)]
     while waiting:

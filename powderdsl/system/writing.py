@@ -67,8 +67,7 @@ def writing(path: Path) -> Iterator[None]:
 def scratch_folder(parent: Path) -> Iterator[Path]:
     """An empty folder in `parent` that only its owner can read, removed at the end with all that it holds.
 
-    Raises:
-        OSError: it cannot be made there.
+    Raises OSError if it cannot be made there.
     """
     with TemporaryDirectory(prefix=MARK, dir=parent, ignore_cleanup_errors=True) as name:
         yield Path(name)
@@ -83,8 +82,7 @@ def write_text(path: Path, text: str) -> None:
 def destination(path: Path, *, follow: bool) -> Path:
     """The path that a write replaces: the path itself, or the target of a link.
 
-    Raises:
-        CompileError: PD613 if something else than a file is there, or links form a loop.
+    Raises CompileError (PD613) if something else than a file is there, or links form a loop.
     """
     try:
         target = path.resolve() if follow and path.is_symlink() else path
@@ -104,8 +102,8 @@ def not_writable(path: Path, error: Exception) -> CompileError:
 def cache_folder(name: str) -> Path:
     """A folder of the user's cache, made with mode 0700. Its contents are loaded and executed.
 
-    Raises:
-        OSError: it cannot be made, belongs to somebody else, or others may write to it; or there is no home folder.
+    Raises OSError if it cannot be made, belongs to somebody else, or others may write to it; or there is no home
+    folder.
     """
     try:
         top = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "powderdsl"

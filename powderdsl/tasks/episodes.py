@@ -293,8 +293,7 @@ def integer_tensor(name: str, values: Any) -> Tensor:
 def check_actions(program: TaskProgram, actions: Any) -> Tensor:
     """Actions from outside as int64 [B, 5] on the program's device; invalid ones are refused.
 
-    Raises:
-        TypeError: they are not integers. ValueError: a wrong shape, or a number out of range, with its index.
+    Raises TypeError if they are not integers, ValueError for a wrong shape, or a number out of range, with its index.
     """
     return check_numbers(actions, program.action_nvec, ACTION).to(program.simulator.device)
 

@@ -128,10 +128,8 @@ def read_task(
 ) -> Task:
     """The checked task of a file's text; warnings stay with the reporter.
 
-    `packs` are added to its rules; `palette` has ids that were recorded.
-
-    Raises:
-        CompileError: with everything that is wrong in the file, and in its rules.
+    `packs` are added to its rules; `palette` has ids that were recorded. Raises CompileError with everything that is
+    wrong in the file, and in its rules.
     """
     tree = read_tree(source, reporter, "a task starts with `task: NAME`")
     reporter.raise_if_errors()

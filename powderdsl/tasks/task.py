@@ -268,8 +268,7 @@ class Task:
 def still_action(task: Task) -> tuple[int, int, int, int, int]:
     """The action ``nothing``; if agents lack it but can blow, blowing still air into the first bin.
 
-    Raises:
-        ValueError: the task has neither.
+    Raises ValueError if the task has neither.
     """
     choices = task.agent.choices
     choice = next((number for number in (NO_CHANGE, BLOW) if number in choices), None)

@@ -176,8 +176,7 @@ class CustomNetwork:
     def build(self, encoder: ActionChannels, seed: int) -> Encoded:
         """A network whose random weights depend on the seed alone.
 
-        Raises:
-            CompileError: PD625 if it is not a module, or making it fails.
+        Raises CompileError (PD625) if it is not a module, or making it fails.
         """
         with torch.random.fork_rng(devices=[]), _reporting_user_errors(self.name, "cannot be made"):
             torch.manual_seed(seed)
@@ -189,8 +188,7 @@ class CustomNetwork:
     def check(self, encoder: ActionChannels, size: tuple[int, int], seed: int) -> None:
         """Try a network on two worlds of a size: the shape of its logits, and whether it can learn.
 
-        Raises:
-            CompileError: PD625.
+        Raises CompileError (PD625).
         """
         network = self.build(encoder, seed)
         state = (encoder.observed + 3,) if encoder.observed else ()

@@ -523,10 +523,8 @@ def check_properties(rules: Ruleset, names: Sequence[str]) -> None:
 class RulesetSource:
     """Draws rulesets around one, which is `rules` as everywhere. The same number gives the same ruleset.
 
-    `palette` has ids that were recorded, as `compiler.load` takes them.
-
-    Raises:
-        CompileError: what loading the rules raises; PD301 for a property that they do not have.
+    `palette` has ids that were recorded, as `compiler.load` takes them. Raises CompileError: what loading the rules
+    raises; PD301 for a property that they do not have.
     """
 
     def __init__(

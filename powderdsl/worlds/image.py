@@ -28,11 +28,9 @@ _MODES = ("1", "L", "LA", "P", "RGB", "RGBA")
 def read_image(path: str | Path, elements: Sequence[Element]) -> NDArray[np.uint8]:
     """The ids uint8 [H, W] of a PNG file, such as `worlds.media.write_png` writes from `simulation.draw.rgb`.
 
-    Colors of a ramp mean its element; the values of its field are not read.
-
-    Raises:
-        CompileError: PD609 for pixel colors without an element, PD607 for too many pixels, PD602 for a file that is not a
-            PNG, PD101 for a file that cannot be read; PD612 if Pillow or NumPy is missing.
+    Colors of a ramp mean its element; the values of its field are not read. Raises CompileError: PD609 for pixel colors
+    without an element, PD607 for too many pixels, PD602 for a file that is not a PNG, PD101 for a file that cannot be
+    read; PD612 if Pillow or NumPy is missing.
     """
     path = Path(path)
     # Four bytes a pixel as one number: red lowest, opacity highest.

@@ -27,8 +27,7 @@ MIN_GIF_DELAY = 20
 def write_png(path: str | Path, image: Any) -> None:
     """Write one picture, uint8 [H, W, 3] (array or tensor).
 
-    Raises:
-        CompileError: PD612 if Pillow is not installed, PD613 if the file cannot be written.
+    Raises CompileError: PD612 if Pillow is not installed, PD613 if the file cannot be written.
     """
     images, frame = require("PIL.Image", "writing a picture", "pip install pillow"), to_numpy(image)
     with replacing(Path(path), follow=True) as temporary:

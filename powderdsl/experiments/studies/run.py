@@ -221,9 +221,8 @@ def _value(measure: Measure, evaluations: Any, point: Point) -> float:
 def read_folders(folders: Sequence[Path], commands: Commands) -> list[StudyRun]:
     """The studies whose results lie in some folders. No other file is read, and none is written.
 
-    Raises:
-        CompileError: PD620 if a folder has no results, PD621 if they are not results of one study, PD112 if it has links
-            that lead out of it, and all that is wrong with the study's text.
+    Raises CompileError: PD620 if a folder has no results, PD621 if they are not results of one study, PD112 if it has
+    links that lead out of it, and all that is wrong with the study's text.
     """
     first, *others = runs = [_read(folder, commands) for folder in folders]
     for run in others:

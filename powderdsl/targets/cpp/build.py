@@ -55,8 +55,7 @@ class Compiler:
 def find_compiler() -> Compiler:
     """The compiler of `$CXX`; without that the first of g++, c++, clang++ and the `ziglang` package that works.
 
-    Raises:
-        NoCompiler: none works. If `$CXX` is set, no other compiler is tried.
+    Raises NoCompiler if none works. If `$CXX` is set, no other compiler is tried.
     """
     cxx = os.environ.get("CXX", "").strip()
     try:

@@ -91,10 +91,8 @@ def check(code: int, what: str) -> None:
 def machine_code(source: KernelSource, architecture: str, version: str) -> bytes:
     """A kernel's machine code, from the cache or newly compiled.
 
-    Safe with other processes doing the same: files are added atomically.
-
-    Raises:
-        NoCuda: NVRTC is missing or failed, or there is no folder for the cache.
+    Safe with other processes doing the same: files are added atomically. Raises NoCuda if NVRTC is missing or failed,
+    or there is no folder for the cache.
     """
     compiler = nvrtc(version)
     major, minor = ctypes.c_int(), ctypes.c_int()
@@ -168,8 +166,7 @@ Compile = Callable[[KernelSource], Launch]
 def cuda_program(program: Program, device: torch.device) -> Runnable:
     """A program for a CUDA device; passes that bit planes cannot represent run on cells.
 
-    Raises:
-        CompileError: PD701 if the device, the driver or NVRTC is missing, here or when a kernel is made.
+    Raises CompileError (PD701) if the device, the driver or NVRTC is missing, here or when a kernel is made.
     """
     version = torch.version.cuda or ""
 

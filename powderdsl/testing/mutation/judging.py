@@ -516,8 +516,7 @@ def _legend(
 def with_tests(source: Source, tests: Sequence[GeneratedTest]) -> str:
     """A pack's text with more tests at the end of its `tests:`; comments and all else stay as they are.
 
-    Raises:
-        ValueError: `tests:` is written in a way that nothing can be added to, as in `tests: [...]`.
+    Raises ValueError if `tests:` is written in a way that nothing can be added to, as in `tests: [...]`.
     """
     root = parse_yaml(source, Reporter())
     text = source.text if source.text.endswith("\n") or not source.text else source.text + "\n"

@@ -228,11 +228,7 @@ def file_of(rules: str, prop: Property) -> Path:
 
 
 def write_example(path: Path, rules: str, prop: Property, counterexample: Counterexample) -> None:
-    """Write a counterexample.
-
-    Raises:
-        CompileError: PD613, the file cannot be written.
-    """
+    """Write a counterexample. Raises CompileError (PD613) if the file cannot be written."""
     tree: dict[str, Tree] = {"rules": rules, "property": prop.text, "steps": str(counterexample.steps)}
     tree |= start_tree(counterexample.sample)
     head = f"# Breaks `{prop.text}` ({prop.place or prop.owner})\n"
@@ -246,8 +242,7 @@ def write_example(path: Path, rules: str, prop: Property, counterexample: Counte
 def read_example(path: Path, ruleset: Ruleset) -> tuple[str, Start, int]:
     """A property's text, a world and a number of steps.
 
-    Raises:
-        CompileError: it cannot be read (PD1xx), or holds no counterexample for these rules (PD602).
+    Raises CompileError if it cannot be read (PD1xx), or holds no counterexample for these rules (PD602).
     """
     tree = read_yaml(path)
     problem = f"{path} is not a counterexample for {ruleset.name}"

@@ -250,8 +250,7 @@ def load_start(path_or_name: str | Path, ruleset: Ruleset, *, size: Size | None 
 def find_scene(path_or_name: str | Path) -> Scene:
     """A scene from a file, or a shipped one by name, as in `load_start`.
 
-    Raises:
-        CompileError: PD601 for an unknown name, PD101 or PD102 for a file that cannot be read, and mistakes in it.
+    Raises CompileError: PD601 for an unknown name, PD101 or PD102 for a file that cannot be read, and mistakes in it.
     """
     text = str(path_or_name)
     file, _, name = text.rpartition("#") if "#" in text else (text, "", "")
@@ -308,12 +307,9 @@ def _checked_scenes(source: Source) -> tuple[Scene, ...]:
 def draw_start(scene: Scene, ruleset: Ruleset, *, size: Size | None = None) -> Start:
     """The start world of a scene.
 
-    Statements run in order: a field is set in the cells of its shape whose element can have it; painting an element later
-    resets the fields there.
-
-    Raises:
-        CompileError: unknown elements (PD604) or fields (PD301), values of another kind (PD110) or out of range
-            (PD402), settings that no cell can have (PD608), a bad `size` (PD607).
+    Statements run in order: a field is set in the cells of its shape whose element can have it; painting an element
+    later resets the fields there. Raises CompileError for unknown elements (PD604) or fields (PD301), values of another
+    kind (PD110) or out of range (PD402), settings that no cell can have (PD608), a bad `size` (PD607).
     """
     size = size or scene.size
     if not (min(size) >= 1 and size[0] * size[1] <= MAX_CELLS):
