@@ -345,7 +345,6 @@ class _Reader:
         return {name: needed[name] for name in needed_first(needed)}
 
     def declaration(self, path: Path | None) -> PackDecl | RulesetDecl | None:
-        """The declaration in a file."""
         source = read_source(path, self.reporter) if path else None
         if source is None:
             return None

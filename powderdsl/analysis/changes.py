@@ -186,7 +186,6 @@ def unchanging_ids(ruleset: Ruleset) -> frozenset[int]:
 
 
 def rule_line(rule: Rule, pass_: Pass) -> RuleLine:
-    """The line of a rule."""
     return RuleLine(rule.span.source.name, rule.span.line, pass_.pack, pass_.name, one_line(rule.span))
 
 

@@ -162,7 +162,6 @@ class Ledger:
 
     @property
     def sums(self) -> dict[str, tuple[tuple[str, ...], ...]]:
-        """All sums by trend."""
         return {
             "constant": self.constant_sums,
             "never falls": self.rising_sums,

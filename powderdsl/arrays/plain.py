@@ -80,7 +80,6 @@ class ndarray:
 
     @property
     def full(self) -> Values:
-        """All values."""
         values, size = self.values, self.size
         return values if len(values) == size else values * size
 

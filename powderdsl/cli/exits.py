@@ -33,7 +33,6 @@ class BadInput(click.ClickException):
 
 
 def version() -> str:
-    """The version of powderdsl."""
     return str(sys.modules["powderdsl"].__version__)  # our own package, so it has been imported
 
 

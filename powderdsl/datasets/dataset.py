@@ -69,7 +69,6 @@ LEVEL = 1
 
 
 def row_shape(recipe: Recipe, name: str) -> tuple[int, ...]:
-    """The shape of a row of an array."""
     return {"observation": recipe.shape, "action": (5,)}.get(name, ())
 
 

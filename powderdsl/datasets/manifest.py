@@ -278,7 +278,6 @@ def episode_bytes(recipe: Recipe) -> int:
 
 
 def _contradictions(recipe: Recipe, shards: Sequence[ShardRow]) -> list[str]:
-    """Contradictions between the values of a recipe, and with the rows of shards."""
     problems, numbers = [], set()
     if len(recipe.channels) != recipe.shape[0]:
         problems.append(

@@ -161,5 +161,4 @@ def similar(word: str) -> tuple[str, ...]:
 
 
 def page(row: Code) -> str:
-    """The Markdown page of a code."""
     return (_PAGES / f"{row.code}.md").read_text(encoding="utf-8")

@@ -40,7 +40,6 @@ def array(tensor: Tensor) -> Array:
 
 
 def arrays(info: Info) -> dict[str, Any]:
-    """Infos in arrays."""
     return {name: arrays(value) if isinstance(value, dict) else array(value) for name, value in info.items()}
 
 

@@ -598,7 +598,6 @@ class PassForm:
 
 
 def choose_form(program: Program, pass_: PassGraph) -> PassForm:
-    """The form in which a pass of a program runs."""
     try:
         return PassForm(pass_, lower_pass(program, pass_))
     except NotBits as error:

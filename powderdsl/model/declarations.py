@@ -281,7 +281,6 @@ class PackDecl(Record, noun="a pack"):
 
     @property
     def lines(self) -> Iterator[Syntax]:
-        """The lines of its passes."""
         return (line for pass_ in self.passes for block in pass_.walk() for line in block.lines)
 
 

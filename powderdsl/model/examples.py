@@ -261,7 +261,6 @@ class _ExampleReader:
     def _grids(
         self, drawn: Sequence[tuple[Scalar, Scalar]], ids: Mapping[str, int], size: str, *, expected: bool
     ) -> tuple[FieldGrid, ...]:
-        """The grids of `fields`, or of `expect_fields`."""
         grids = []
         for key, scalar in drawn:
             with suppress(Poisoned):

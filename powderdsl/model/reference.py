@@ -471,7 +471,6 @@ def clamp(state: State, table: Mapping[str, Slot]) -> State:
 
 
 def run_pass(pass_: Pass, at: Context, table: Mapping[str, Slot]) -> State:
-    """The state after one pass."""
     scratch = scratch_slots(pass_)
     at.state = {**at.state, **{name: _fresh(slot, at.shape) for name, slot in scratch.items()}}
     at.lets = {}

@@ -192,7 +192,6 @@ def _choice_condition(node: Node, arg: Node, graph: Graph) -> Node:
 
 
 def draw_under(draw: Node, condition: Node, graph: Graph) -> Node:
-    """The same draw under another condition."""
     count = draw.attr[1] + 1 if draw.op == "below_planes" else 0
     return graph.node(draw.op, FLAG, (*draw.args[:count], condition), draw.attr)
 

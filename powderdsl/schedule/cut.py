@@ -132,7 +132,6 @@ class _Cutter:
     # Statements
 
     def block(self, body: Block, *, top: bool = False) -> Block:
-        """A block as loops."""
         with self.inner() as statements:
             for before, statement, after in zip((None, *body), body, (*body[1:], None), strict=False):
                 if isinstance(statement, Guard):

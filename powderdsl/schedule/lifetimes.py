@@ -335,7 +335,6 @@ class _Assignment:
         self.last |= {name: max(self.last.get(name, -1), position) for name in names}
 
     def assign(self) -> dict[str, Buffer]:
-        """The buffer of each variable."""
         busy = {number: name for name, number in self.buffer.items()}
         for position, statement in enumerate(self.order):
             busy = {key: name for key, name in busy.items() if self.last.get(name, -1) >= position}

@@ -136,7 +136,6 @@ def _pass_condition(schedule: Schedule, bits: dict[str, int]) -> Node | None:
 
 
 def tested_ids(schedule: Schedule) -> int:
-    """All ids whose presence a schedule tests."""
     nodes = ordered(filter(None, [*schedule.values, schedule.when]))
     return reduce(or_, (node.attr for node in nodes if node.op == "present"), 0)
 

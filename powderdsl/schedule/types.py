@@ -348,7 +348,6 @@ def in_order(names: Iterable[str]) -> list[str]:
 
 
 def variables(schedule: Schedule) -> dict[str, Var]:
-    """All variables by name."""
     return {var.name: var for _, var in schedule.inputs} | made_in(schedule.body)
 
 
@@ -517,7 +516,6 @@ _INFIX = {
 
 
 def print_schedule(schedule: Schedule) -> str:
-    """A schedule as text."""
     names = _Names()
     lines = [f"schedule {schedule.name}"]
     if schedule.inputs:

@@ -35,7 +35,6 @@ class Syntax:
     span: Span = field(compare=False, repr=False)
 
     def child(self, kind: str) -> Syntax | None:
-        """The first child of a kind."""
         return next((child for child in self.children if child.kind == kind), None)
 
     def dump(self, indent: str = "") -> str:

@@ -46,7 +46,6 @@ class ArrayKind:
         return np.array(values, dtype)
 
     def zeros(self, dtype: str, shape: tuple[int, ...]) -> Array:
-        """A new array of zeros."""
         return np.zeros(shape, dtype)
 
     def arange(self, count: int) -> Array:

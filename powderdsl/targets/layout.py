@@ -148,7 +148,6 @@ class NativeLayout(Layout):
 
 
 def layout_of(program: Program) -> Layout:
-    """The layout of a program on planes."""
     layout = Layout()
     for slot in program.slots:
         number(layout.reals if slot.type.name == "real" else layout.planes, slot.name)

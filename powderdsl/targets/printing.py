@@ -23,7 +23,6 @@ class Printer:
     update: Callable[[Compute], Any]
 
     def block(self, body: Sequence[Statement]) -> Any:
-        """The lines of statements."""
         for statement in body:
             yield from getattr(self, type(statement).__name__.lower())(statement)
 

@@ -284,7 +284,6 @@ def _words(ruleset: Ruleset) -> dict[str, list[str]]:
 
 @cache
 def session() -> Session:
-    """The session of this process."""
     folder = Path(tempfile.mkdtemp()) / "rules"
     folder.mkdir()
     return Session(folder)

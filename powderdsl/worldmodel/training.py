@@ -157,7 +157,6 @@ class Replay:
 
 
 def memory_of(device: torch.device) -> int:
-    """The memory of a device in bytes."""
     if device.type == "cuda":
         return int(torch.cuda.get_device_properties(device).total_memory)
     try:

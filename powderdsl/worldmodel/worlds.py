@@ -173,7 +173,6 @@ class TaskWorlds:
         return MixedWorld(tuple(parts))
 
     def later(self, world: MixedWorld, steps: int) -> MixedWorld:
-        """The worlds some steps later."""
         later = [
             part._replace(world=part.world.sim.step(part.world, steps, params=part.params or None))
             for part in world.parts

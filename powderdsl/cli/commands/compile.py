@@ -74,7 +74,6 @@ def _checked(ruleset: Ruleset, stage: str, backend: str, after: str | None, pass
 def _schedules(
     parts: Sequence[Segment], backend: str, after: str | None, pass_name: str | None
 ) -> Iterator[str]:
-    """The schedule of each pass of a backend after a stage of the planner."""
     from powderdsl.schedule.stages import PLANNERS, steps
     from powderdsl.schedule.types import print_schedule
 

@@ -41,7 +41,6 @@ WORKS_ON = {("evaluate",): AGENT, ("wm", "finetune"): NETWORK, ("wm", "eval"): N
 
 
 def called(words: tuple[str, ...]) -> click.Command:
-    """The click command that some words name."""
     command: click.Command = import_module(f"powderdsl.cli.commands.{words[0]}").command
     for word in words[1:]:
         assert isinstance(command, click.Group)

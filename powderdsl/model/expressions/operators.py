@@ -213,7 +213,6 @@ def is_integer(value: Expr) -> bool:
 def integer_constant(
     typer: Typer, syntax: Syntax, scope: Scope, lo: int, hi: int, message: str, label: str = "", *helps: str
 ) -> int:
-    """An integer constant from `lo` to `hi`."""
     value = typer.evaluate(syntax, scope)
     if isinstance(value, Expr) and value.kind == NUMBER and is_integer(value) and lo <= value.value <= hi:
         return int(value.value)

@@ -111,7 +111,6 @@ class Answers(dict[Key, bool | None]):
         self[rule] = some((self.get(rule, False), answer))
 
     def where(self, answer: bool | None) -> list[Key]:
-        """The rules with this answer."""
         return [rule for rule, known in self.items() if known is answer]
 
 

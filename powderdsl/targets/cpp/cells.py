@@ -210,7 +210,6 @@ class _Loop(CellValues[str]):
                 yield f"finish_row<{'REACH' if reach == ANY_PASS else reach}>(c, o{name});"
 
     def row_outside_region(self) -> Iterator[str]:
-        """The values of a row outside the region."""
         for name, value in self.plan.loop.olds.items():
             if name in self.rows.rings:
                 yield f"{self.at(name, 0)} = nothing;"

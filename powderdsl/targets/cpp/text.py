@@ -32,7 +32,6 @@ LOOP = (
 
 
 def pass_text(schedule: Schedule, number: int, layout: NativeLayout) -> str:
-    """The function of a pass."""
     printer = _Printer(layout, schedule)
     changed = dict(schedule.outputs)
     lines = [f"// pass {number}\n__attribute__((noinline)) void pass_{number}(Context& c) {{"]

@@ -28,7 +28,6 @@ _FLOATS = {
 
 
 def pass_text(schedule: Schedule, layout: Layout) -> str:
-    """The statements of a pass."""
     numbers = {name: number for name, (_, number) in schedule.buffers}
     return "\n".join(_Printer(numbers, layout).block(schedule.body))
 

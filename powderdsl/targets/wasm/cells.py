@@ -161,7 +161,6 @@ class CellLoop(Loop):
     # Values, chunk by chunk
 
     def skip_outside_region(self) -> None:
-        """Skip a line outside the region."""
         if self.loop.region is None:
             return
         fields, planes = region_of(self.loop)

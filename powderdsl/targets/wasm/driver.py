@@ -117,7 +117,6 @@ class Batches:
 
     @contextmanager
     def each_line(self, lane: Value) -> Iterator[Local]:
-        """The lines of a lane."""
         first = body.let(lane * self.library.rows)
         with body.each(first, first + self.library.rows) as line:
             yield line

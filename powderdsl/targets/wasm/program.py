@@ -141,7 +141,6 @@ class Instance:
         return batch
 
     def pack(self, state: Mapping[str, Array]) -> int:
-        """A batch with a state."""
         worlds, rows, _ = shape_of(state)
         batch = self.new(worlds, rows)
         for name, array in state.items():

@@ -78,7 +78,6 @@ def _schedule(program: Program, pass_: PassGraph, memo: Memo | None) -> Schedule
 
 
 def pass_function_name(name: str) -> str:
-    """The name of a pass's function."""
     return f"pass_{name}"
 
 

@@ -47,7 +47,6 @@ class Loop:
         """The planes that are read in other rows."""
 
     def write(self) -> None:
-        """Write the function."""
         raise NotImplementedError
 
     def build(self) -> Callee:

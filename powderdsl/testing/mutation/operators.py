@@ -486,7 +486,6 @@ class Entry:
         ]
 
     def line(self, start: str = "expression") -> Changes:
-        """The mistakes in its line."""
         if isinstance(self.node, Scalar) and self.node.text:
             tree = parse_scalar(self.node, start, Reporter())
             if tree is not None:

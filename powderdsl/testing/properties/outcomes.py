@@ -324,7 +324,6 @@ def line_of(tree: Tree) -> str:
 
 
 def start_tree(start: Start) -> dict[str, Tree]:
-    """Start worlds as a tree."""
     tree: dict[str, Tree] = {
         "seed": str(start.seed[0]),
         "step": str(start.step[0]),

@@ -274,7 +274,6 @@ def turned_back(values: Array, turn: str) -> Array:
 
 
 def turned_values(slot: Slot, values: Array, turn: str) -> Array:
-    """A slot's array, turned."""
     cells = turned_cells(values, turn)
     if slot.kind.name == "direction":  # octants count clockwise from the right
         octants = 4 - cells.astype(np.int64) if turn == "mirrored" else cells + 2

@@ -220,7 +220,6 @@ Written = Syntax | Scalar
 
 
 def number(value: int, span: Span | None = None) -> Expr:
-    """A constant."""
     return Expr("const", integer(value, value), value=value, span=span)
 
 
