@@ -89,9 +89,7 @@ def shipped_tests() -> list[str]:
 
 
 def load(
-    *names: str | Path,
-    params: Mapping[str, Any] | None = None,
-    palette: Palette | None = None,
+    *names: str | Path, params: Mapping[str, Any] | None = None, palette: Palette | None = None
 ) -> Ruleset:
     """Read rule files into a checked model.
 
@@ -116,9 +114,7 @@ def load(
 
 @collection_paused()
 def load_with_diagnostics(
-    *names: str | Path,
-    params: Mapping[str, Any] | None = None,
-    palette: Palette | None = None,
+    *names: str | Path, params: Mapping[str, Any] | None = None, palette: Palette | None = None
 ) -> tuple[Ruleset, tuple[Diagnostic, ...]]:
     """Read rule files as `load` does; return the checked model, and its warnings and notes in source order."""
     reporter = Reporter()

@@ -45,11 +45,7 @@ def require_minari() -> None:
 
 
 def to_minari(
-    dataset: Dataset,
-    dataset_id: str,
-    *,
-    author: str | None = None,
-    description: str | None = None,
+    dataset: Dataset, dataset_id: str, *, author: str | None = None, description: str | None = None
 ) -> minari.MinariDataset:
     """Write a dataset to Minari's folder, episode by episode, completely or not at all.
 

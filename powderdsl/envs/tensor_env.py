@@ -190,10 +190,7 @@ class TensorEnv:
     # Beginning
 
     def reset(
-        self,
-        *,
-        seed: int | Sequence[int | None] | None = None,
-        options: Mapping[str, Any] | None = None,
+        self, *, seed: int | Sequence[int | None] | None = None, options: Mapping[str, Any] | None = None
     ) -> tuple[Tensor, Info]:
         """Begin all episodes, or those of a mask.
 

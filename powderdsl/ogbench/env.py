@@ -242,10 +242,7 @@ class PowderworldVectorEnv(_Face, VectorEnv[Any, Any, Any]):
         self._over = np.zeros(num_envs, dtype=bool)
 
     def reset(
-        self,
-        *,
-        seed: int | Sequence[int | None] | None = None,
-        options: Mapping[str, Any] | None = None,
+        self, *, seed: int | Sequence[int | None] | None = None, options: Mapping[str, Any] | None = None
     ) -> tuple[Array, dict[str, Any]]:
         """Begin all episodes, or those of a mask.
 

@@ -41,9 +41,7 @@ class TrainConfig:
     worlds: int = setting(1_000_000, "How many worlds there are to draw from.", 1, 2**62)
     observation: str = setting("compact", "Observation of the network.", choices=OBSERVATIONS)
     network: str = setting(
-        "paper",
-        "The paper's, a small one, or a fully convolutional one.",
-        choices=tuple(USUAL_OBSERVATION),
+        "paper", "The paper's, a small one, or a fully convolutional one.", choices=tuple(USUAL_OBSERVATION)
     )
     features: int = setting(256, "Width of its fully connected layers; of `fcn`, its channels.", 1, 1 << 16)
     frames: int = setting(1, "Observations that it sees at once, the last ones.", 1, 16)

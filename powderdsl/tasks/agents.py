@@ -65,8 +65,7 @@ class MoveDecl(Record, noun="a move"):
     at: Node | None = keyed("where: `[row, column]`, or `most(CELLS)`, the block with most of these cells")
     within: Scalar | None = keyed("a shape, in one line: only its cells count for `most`")
     least: int | None = keyed(
-        "how many cells `most` must find for the move to apply; 1 by default",
-        bounds=(1, MAX_SIDE * MAX_SIDE),
+        "how many cells `most` must find for the move to apply; 1 by default", bounds=(1, MAX_SIDE * MAX_SIDE)
     )
     condition: Syntax | None = keyed(
         "when: a condition; the first move whose condition holds is played", name="if"

@@ -164,11 +164,7 @@ def _score(predict: Network, starts: Tensor, ends: Tensor, slots: int) -> Score:
     most = chances.gather(1, predicted[:, None])[:, 0]
     stays = chances.gather(1, starts.long()[:, None])[:, 0]
     changed, right = starts != ends, predicted == truth
-    tables = (
-        _binned(most, right),
-        _binned(most[changed], right[changed]),
-        _binned(1 - stays, changed),
-    )
+    tables = (_binned(most, right), _binned(most[changed], right[changed]), _binned(1 - stays, changed))
     return Score(
         float(loss),
         _counts(truth, predicted, slots),

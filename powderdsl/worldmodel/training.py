@@ -448,10 +448,7 @@ class Trained:
 
 
 def load_trained(
-    path: str | Path | RunFolder,
-    *,
-    device: str = "cpu",
-    network: nn.Module | CustomNetwork | None = None,
+    path: str | Path | RunFolder, *, device: str = "cpu", network: nn.Module | CustomNetwork | None = None
 ) -> Trained:
     """The network of a run, with its newest weights, ready to predict.
 

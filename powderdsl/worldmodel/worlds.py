@@ -115,12 +115,7 @@ class TaskWorlds:
     """
 
     def __init__(
-        self,
-        config: DataConfig,
-        *,
-        partly: bool = False,
-        palette: Palette | None = None,
-        **machine: Any,
+        self, config: DataConfig, *, partly: bool = False, palette: Palette | None = None, **machine: Any
     ):
         params = None if config.rules else config.params
         task = load_task(config.task, knobs=config.knobs, params=params, palette=palette)

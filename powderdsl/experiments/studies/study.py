@@ -34,9 +34,7 @@ Commands = Mapping[tuple[str, ...], Mapping[str, str]]
 """Commands that steps may call, with the meaning of each option (without dashes) and of the argument (``on``)."""
 
 VALUE = Form(
-    "[A-Za-z0-9_.+-]{1,60}",
-    "a value here",
-    "letters, digits and `_.+-`: folders are named after values",
+    "[A-Za-z0-9_.+-]{1,60}", "a value here", "letters, digits and `_.+-`: folders are named after values"
 )
 
 

@@ -301,11 +301,7 @@ class _Painter:
             self.rows = first, last * self.active[..., None]  # no rows without the repetition
 
     def painted(
-        self,
-        ids: Array,
-        repeat: int,
-        regions: Mapping[str, Array],
-        fields: dict[str, tuple[Array, Array]],
+        self, ids: Array, repeat: int, regions: Mapping[str, Array], fields: dict[str, tuple[Array, Array]]
     ) -> Array:
         """Worlds with one repetition on top: uint8 [B, H, W]."""
         drawing, maker = self.drawing, self.maker

@@ -73,11 +73,7 @@ class InvariantSearch:
 
     @classmethod
     def of(
-        cls,
-        runner: Runs,
-        plan: SearchPlan,
-        declared_only: bool = False,
-        ledger: Ledger | None = None,
+        cls, runner: Runs, plan: SearchPlan, declared_only: bool = False, ledger: Ledger | None = None
     ) -> Self:
         """Prove what can be proven; the rest is to be tried. `declared_only`: leave out what no pack claims.
 
@@ -357,12 +353,7 @@ Judge = Callable[[Start, int], Array]
 
 
 def shrink(
-    claim: Tested,
-    runs: Runs,
-    sample: Start,
-    steps: int,
-    work: Work,
-    without: frozenset[int],
+    claim: Tested, runs: Runs, sample: Start, steps: int, work: Work, without: frozenset[int]
 ) -> tuple[Start, int]:
     """The smallest world found that still breaks the claim, and after how many steps. `sample` is one world.
 

@@ -83,10 +83,7 @@ class Statement:
 
 
 def amounts_of(
-    statement: Statement,
-    names: Mapping[str, Expr | None],
-    reporter: Reporter,
-    most: int = MAX_COORDINATE,
+    statement: Statement, names: Mapping[str, Expr | None], reporter: Reporter, most: int = MAX_COORDINATE
 ) -> tuple[Expr | None, ...] | None:
     """The amounts of a statement's numbers, within ±most, None for open ends. None after a report (PD606, PD802)."""
     amounts: list[Expr | None] = []
