@@ -21,10 +21,13 @@ from powderdsl.targets.torch.planes import Key, Source, pass_source
 from powderdsl.targets.torch.program import step_keys
 from powderdsl.targets.torch.source import load_source
 
-CHUNK = 1 << 19
+CHUNK = 1 << 18
 """Cells of the worlds that an eager program steps together: about as many as the cache holds."""
 
 MOST_SIZES = 8
+
+FIXED = ("row", "column", "inside", "inside_mask", "left")
+"""Inputs of passes that depend on the grid only: methods of the library."""
 
 Batch = tuple[Tensor, tuple[Tensor, ...]]
 """Words of all planes, int64 [planes, H, B, K], and floats of each field, see `library`."""
@@ -80,12 +83,15 @@ class PlanesProgram:
         """The state `job.steps` later; no host sync, except on the CPU."""
         like = like_of(job.state)
         batch, height, width = shape_of(job.state)
-        size = max(1, CHUNK // (height * width)) if self.eager else batch
+        count = -(-batch * height * width // CHUNK) if self.eager else 1
+        size = -(-batch // count)
         parts = [slice(start, min(start + size, batch)) for start in range(0, batch, size)]
-        if self._settings is None or self._settings[0] is not job.params:
-            self._settings = (job.params, [self._parameters(job.params, part) for part in parts])
+        settings = self._settings
+        if settings is None or settings[0] is not job.params:
+            settings = (job.params, [self._parameters(job.params, part) for part in parts])
+            self._settings = settings
         chunks = []
-        for number, (part, settings) in enumerate(zip(parts, self._settings[1], strict=True)):
+        for number, part in enumerate(parts):
             with torch.inference_mode():
                 kernels = self._sized(part.stop - part.start, height, width)
                 if isinstance(job.state, PlanesState) and job.state.program is self:
@@ -93,14 +99,17 @@ class PlanesProgram:
                 else:
                     chunk = self.pack(kernels.k, {name: array[part] for name, array in job.state.items()})
                 seed, index, step = job.clock.seed[part], job.clock.world[part], job.clock.step[part]
-                chunks.append(self._steps(kernels, chunk, job, base_keys(seed, index), step, settings))
+                chunks.append(
+                    self._steps(kernels, chunk, job, base_keys(seed, index), step, settings[1][number])
+                )
         return PlanesState(self, chunks, like)
 
     def _function(self, source: Source) -> Callable[..., Batch]:
         return load_source(source.text, source.name, {"inf": float("inf"), "nan": float("nan")})
 
     def _sized(self, batch: int, height: int, width: int) -> _Kernels:
-        key = (batch, height, width, get_ident())  # libraries have memory that threads must not share
+        # The eager library has memory that threads must not share.
+        key = (batch, height, width, get_ident() if self.eager else 0)
         if key not in self._kernels:
             if len(self._kernels) >= MOST_SIZES:
                 self._kernels.clear()
@@ -116,28 +125,15 @@ class PlanesProgram:
         return self._kernels[key]
 
     def _steps(
-        self,
-        kernels: _Kernels,
-        chunk: Batch,
-        job: Job,
-        base: Tensor,
-        start: Tensor,
-        settings: Mapping[Key, Any],
+        self, kernels: _Kernels, chunk: Batch, job: Job, base: Tensor, start: Tensor, settings: dict[Key, Any]
     ) -> Batch:
         k, (words, fields) = kernels.k, chunk
-        fixed = {
-            **settings,
-            **{
-                key: self._fixed(k, key)
-                for key in self._keys("row", "column", "inside", "inside_mask", "left")
-            },
-        }
+        fixed = {key: self._fixed(k, key) for key in self._keys(*FIXED)} | settings
         for i in range(job.steps):
             step = start + i
-            drawn = (
-                kernels.draw(k, base, step, self._idents, tuple(self._bits.values())) if self._bits else ()
-            )
             values = dict(fixed)
+            bits = tuple(self._bits.values())
+            drawn = kernels.draw(k, base, step, self._idents, bits) if bits else ()
             for stream, planes in zip(self._bits, drawn, strict=True):
                 values["draws", stream] = planes.unbind() if self.eager else planes
             for key in self._keys("step"):
