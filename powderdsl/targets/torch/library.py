@@ -11,7 +11,7 @@ parameters, which all cells share, are broadcast. There are two libraries with t
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -23,13 +23,6 @@ from powderdsl.ir.ops import SNAP
 from powderdsl.schedule.types import Leftover
 from powderdsl.system.random import MASK
 from powderdsl.targets.tensor_kind import WORD, word_count
-
-_ALL = (1 << WORD) - 1
-
-
-def _signed(word: int) -> int:
-    """The int64 with some 64 bits."""
-    return word - (1 << WORD) if word >> (WORD - 1) else word
 
 
 class Portable:
@@ -109,7 +102,7 @@ class Portable:
 
     def inside(self, dy: int, dx: int) -> Tensor:
         """The cells whose neighbor lies inside the grid."""
-        columns = sum(1 << x for x in range(self.width) if 0 <= x + dx < self.width)
+        columns = self._columns_where(lambda x: 0 <= x + dx < self.width)
         return self._by_row([columns if 0 <= y + dy < self.height else 0 for y in range(self.height)])
 
     def inside_mask(self, dy: int, dx: int) -> Tensor:
@@ -122,12 +115,17 @@ class Portable:
 
     def column(self, modulus: int, bit: int) -> Tensor:
         """A bit of the number of each column, modulo a number."""
-        return self._by_row([sum(1 << x for x in range(self.width) if x % modulus >> bit & 1)])
+        return self._by_row([self._columns_where(lambda x: bool(x % modulus >> bit & 1))])
+
+    def _columns_where(self, holds: Callable[[int], bool]) -> int:
+        """The columns for which a function holds, as the bits of a number."""
+        return int("".join("01"[holds(x)] for x in reversed(range(self.width))), 2)
 
     def _by_row(self, rows: Sequence[int]) -> Tensor:
         """A plane of the columns of each row, or of all rows."""
-        words = [[_signed(row >> i & _ALL) for i in range(0, self.across * WORD, WORD)] for row in rows]
-        return torch.tensor(words, device=self.device)[:, None]
+        size = self.across * WORD
+        words = [np.frombuffer((row % (1 << size)).to_bytes(size // 8, "little"), "<i8") for row in rows]
+        return torch.from_numpy(np.stack(words).astype(np.int64))[:, None].to(self.device)
 
     # Movements of planes [P, H, B, K]. No cell is a mover and a target of the same exchange.
 
