@@ -12,6 +12,7 @@ from typing import Any
 
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 
 from powderdsl.ir.bits import segments
 from powderdsl.ir.ops import SNAP, Program, Threshold, kernel_rows
@@ -81,8 +82,7 @@ class Kernels:
     snap: float = SNAP
     """Smaller magnitudes of float slots become zero at the end of a pass."""
     keys: Tensor = field(init=False)
-    _draws: dict[tuple[str, int], Tensor] = field(default_factory=dict)
-    _masks: dict[tuple[int, int], Tensor] = field(default_factory=dict)
+    _draws: dict[str, Tensor] = field(default_factory=dict)
 
     def begin(self, step: Tensor) -> None:
         """Start a step: new keys, no draws yet."""
@@ -91,7 +91,7 @@ class Kernels:
         self._draws.clear()
 
     def full(self, x: Tensor) -> Tensor:
-        return x if x.shape == self.shape else x.expand(self.shape)
+        return x.expand(self.shape)
 
     def roll(self, x: Tensor, dy: int, dx: int) -> Tensor:
         """The value at the neighbor (dy, dx); the grid wraps."""
@@ -99,17 +99,13 @@ class Kernels:
 
     def reach(self, x: Tensor, dy: int, dx: int) -> Tensor:
         """The value at the neighbor (dy, dx), zero outside the grid."""
-        rolled = self.roll(x, dy, dx)
-        return torch.where(self.inside(dy, dx), rolled, torch.zeros((), dtype=x.dtype, device=self.device))
+        margin = max(abs(dy), abs(dx))
+        _, height, width = self.shape
+        return pad(self.full(x), (margin,) * 4).narrow(1, margin + dy, height).narrow(2, margin + dx, width)
 
     def inside(self, dy: int, dx: int) -> Tensor:
-        """True where the neighbor lies inside the grid: bool [H, W]."""
-        if (dy, dx) not in self._masks:
-            _, height, width = self.shape
-            y = torch.arange(height, device=self.device)[:, None] + dy
-            x = torch.arange(width, device=self.device)[None] + dx
-            self._masks[dy, dx] = (y >= 0) & (y < height) & (x >= 0) & (x < width)
-        return self._masks[dy, dx]
+        """True where the neighbor lies inside the grid."""
+        return self.reach(torch.ones((), dtype=torch.bool, device=self.device), dy, dx)
 
     def count(self, x: Tensor, weights: tuple[tuple[int, int, int], ...], wraps: bool) -> Tensor:
         """The weighted number of neighbors where a flag holds: sums of rows first, each pattern of weights once.
@@ -123,7 +119,7 @@ class Kernels:
         cells = self.full(x).to(dtype)
         if wraps:  # padding wraps once: copies side by side where the kernel is larger than the world
             cells = cells.repeat(1, *(max(1, -(-margin // n)) for n in (height, width)))
-        cells = torch.nn.functional.pad(cells, (margin,) * 4, "circular" if wraps else "constant")
+        cells = pad(cells, (margin,) * 4, "circular" if wraps else "constant")
         sums: dict[tuple[tuple[int, int], ...], Tensor] = {}
         total = torch.zeros(self.shape, dtype=dtype, device=self.device)
         for dy, pattern in kernel_rows(weights).items():
@@ -134,21 +130,19 @@ class Kernels:
             total += sums[pattern].narrow(1, margin + dy, height)
         return total.to(torch.int32)
 
-    def draw(self, stream: str, bits: int) -> Tensor:
-        """The first `bits` bits of a stream's draws, int64 [B, H, W]."""
-        key = (stream, bits)
-        if key not in self._draws:
-            position, resolution = self.streams[stream]
-            if stream in self.replacements:
-                self._draws[key] = self.replacements[stream] >> (resolution - bits)
-            else:
-                self._draws[key] = draws(self.keys[position], bits, *self.shape[1:])
-        return self._draws[key]
+    def draw(self, stream: str) -> Tensor:
+        """A stream's draws as integers, int64 [B, H, W]."""
+        if stream not in self._draws:
+            position, bits = self.streams[stream]
+            given = self.replacements.get(stream)
+            self._draws[stream] = (
+                draws(self.keys[position], bits, *self.shape[1:]) if given is None else given
+            )
+        return self._draws[stream]
 
     def draw_real(self, stream: str) -> Tensor:
         """A stream's draws in (0, 1), float32."""
-        bits = self.streams[stream][1]
-        return ((self.draw(stream, bits).double() + 0.5) / float(1 << bits)).float()
+        return ((self.draw(stream).double() + 0.5) / float(1 << self.streams[stream][1])).float()
 
     def coordinate(self, axis: str, modulus: int) -> Tensor:
         _, height, width = self.shape
@@ -167,24 +161,10 @@ class Kernels:
         """A parameter as a chance [B, 1, 1]: the number of possible draws below it, or not above it."""
         return limits(torch, self.params[name], Threshold(bits, strict))[:, None, None]
 
-    @staticmethod
-    def divide(a: Tensor, b: Tensor) -> Tensor:
-        return torch.where(b == 0, torch.zeros((), dtype=a.dtype, device=a.device), a / b)
-
-    @staticmethod
-    def quotient(a: Any, b: Any) -> Tensor:
-        """Integer division, rounded down; 0 where b is 0. One of the two may be a constant."""
-        if isinstance(b, int):
-            return torch.div(a, b, rounding_mode="floor")  # no rule divides by the constant 0
-        numerator = torch.full_like(b, a) if isinstance(a, int) else a
-        result = torch.div(numerator, torch.where(b == 0, torch.ones_like(b), b), rounding_mode="floor")
-        return torch.where(b == 0, torch.zeros_like(result), result)
-
     def settle(self, x: Tensor, low: float, high: float) -> Tensor:
         """No NaN, within bounds, nothing smaller than `snap`."""
-        zero = torch.zeros((), dtype=x.dtype, device=x.device)
-        x = torch.where(x == x, x, zero).clamp(low, high)
-        return torch.where(x.abs() < self.snap, zero, x)
+        x = x.masked_fill(x.isnan(), 0).clamp(low, high)
+        return x.masked_fill(x.abs() < self.snap, 0)
 
 
 class TorchProgram:

@@ -11,40 +11,24 @@ from zlib import crc32
 from powderdsl.ir.ops import Node, PassGraph, Program, nodes_of
 
 _QUOTED = re.compile(r"'[^']*'")
-_PLANE = re.compile(r"\b[bfmns][0-9]+\b")
+_PLANE = re.compile(r"\b[bfmn][0-9]+\b")
 
 
 class _Writer:
-    """Collects lines and constants; shifted planes are computed once."""
+    """Collects lines and constants."""
 
-    def __init__(self, significant: Mapping[str, int]):
+    def __init__(self) -> None:
         self.lines: list[str] = []
-        self.constants: dict[str, object] = {}
+        self.constants: dict[tuple[type, object], str] = {}
         self.names: dict[Node, str] = {}
-        self.shifted: dict[tuple[str, int, int], str] = {}
-        self.significant = significant
 
     def constant(self, value: object) -> str:
-        for name, known in self.constants.items():
-            if type(known) is type(value) and known == value:
-                return name
-        name = f"c{len(self.constants)}"
-        self.constants[name] = value
-        return name
-
-    def roll(self, name: str, dy: int, dx: int) -> str:
-        key = (name, dy, dx)
-        if key not in self.shifted:
-            self.shifted[key] = f"s{len(self.shifted)}"
-            self.lines.append(f"{self.shifted[key]} = k.roll({name}, {dy}, {dx})")
-        return self.shifted[key]
+        return self.constants.setdefault((type(value), value), f"c{len(self.constants)}")
 
     def node(self, node: Node) -> None:
         args = [self.names[arg] for arg in node.args]
         if node.op == "const":
             self.names[node] = self.constant(node.attr)
-        elif node.op == "shift" and node.attr[2]:
-            self.names[node] = self.roll(args[0], *node.attr[:2])
         else:
             row = _KERNELS[node.op]
             text = row.format(*args, attr=node.attr) if isinstance(row, str) else row(self, node, *args)
@@ -59,34 +43,16 @@ def _param(writer: _Writer, node: Node) -> str:
     return f"k.limit({name!r}, {threshold.bits}, {threshold.strict})"
 
 
-def _below(writer: _Writer, node: Node, limit: str) -> str:
-    """A draw below a limit. Constant limits need only the bits down to their last one."""
-    stream, bits = node.attr
-    (argument,) = node.args
-    if argument.op == "const":
-        significant = writer.significant[stream]
-        return f"k.draw({stream!r}, {significant}) < {int(argument.attr) >> (bits - significant)}"
-    return f"k.draw({stream!r}, {bits}) < {limit}"
-
-
 def _in_set(writer: _Writer, node: Node, value: str) -> str:
-    members = sorted(node.attr)
-    lo, hi = node.args[0].type.lo, node.args[0].type.hi
+    members, (lo, hi) = sorted(node.attr), (node.args[0].type.lo, node.args[0].type.hi)
     others = [i for i in range(lo, hi + 1) if i not in members]
     if len(members) == 1:
         return f"{value} == {members[0]}"
     if len(others) == 1:
         return f"{value} != {others[0]}"
-    if members[-1] - members[0] == len(members) - 1:
-        if members[0] == lo:
-            return f"{value} <= {members[-1]}"
-        if members[-1] == hi:
-            return f"{value} >= {members[0]}"
-    if lo >= 0 and hi < 31:
-        bits = sum(1 << i for i in members)
-        return f"(({writer.constant(bits)} >> {value}) & 1) != 0"
-    table = tuple(int(i in members) for i in range(lo, hi + 1))
-    return f"{writer.constant(table)}[({value} - {lo}).long()] != 0"
+    if lo >= 0 and hi < 31:  # several times as fast as `isin`
+        return f"(({writer.constant(sum(1 << i for i in members))} >> {value}) & 1) != 0"
+    return f"torch.isin({value}, {writer.constant(tuple(members))})"
 
 
 def _select(writer: _Writer, node: Node, condition: str, yes: str, no: str) -> str:
@@ -95,16 +61,13 @@ def _select(writer: _Writer, node: Node, condition: str, yes: str, no: str) -> s
 
 
 def _swap(writer: _Writer, node: Node, content: str, movers: str, rest: str) -> str:
-    dy, dx = node.attr
-    there, back = writer.roll(content, dy, dx), writer.roll(content, -dy, -dx)
-    targets = writer.roll(movers, -dy, -dx)
-    return f"torch.where({movers}, {there}, torch.where({targets}, {back}, {rest}))"
+    there = f"k.roll({content}, {node.attr[0]}, {node.attr[1]})"
+    return f"torch.where({movers}, {there}, {_arrive(writer, node, content, movers, rest)})"
 
 
 def _arrive(writer: _Writer, node: Node, content: str, movers: str, rest: str) -> str:
-    dy, dx = node.attr
-    targets, back = writer.roll(movers, -dy, -dx), writer.roll(content, -dy, -dx)
-    return f"torch.where({targets}, {back}, {rest})"
+    back = f"{-node.attr[0]}, {-node.attr[1]}"
+    return f"torch.where(k.roll({movers}, {back}), k.roll({content}, {back}), {rest})"
 
 
 _KERNELS: dict[str, str | Callable[..., str]] = {
@@ -112,9 +75,11 @@ _KERNELS: dict[str, str | Callable[..., str]] = {
     "param": _param,
     "coordinate": "k.coordinate({attr[0]!r}, {attr[1]})",
     "inside": "k.inside({attr[0]}, {attr[1]})",
-    "below": _below,
+    "below": "k.draw({attr[0]!r}) < {0}",
     "draw": "k.draw_real({attr[0]!r})",
-    "shift": "k.reach({0}, {attr[0]}, {attr[1]})",
+    "shift": lambda writer, node, x: "k.{}({}, {}, {})".format(
+        "roll" if node.attr[2] else "reach", x, *node.attr[:2]
+    ),
     "count": "k.count({0}, {attr[0]}, {attr[1]})",
     "not": "~{0}",
     "and": "{0} & {1}",
@@ -128,8 +93,10 @@ _KERNELS: dict[str, str | Callable[..., str]] = {
     "add": "{0} + {1}",
     "sub": "{0} - {1}",
     "mul": "{0} * {1}",
-    "div": "k.divide({0}, {1})",
-    "quotient": "k.quotient({0}, {1})",
+    "div": "({0} / {1}).masked_fill({1} == 0, 0)",
+    "quotient": (
+        "torch.div({0}, {1}.masked_fill({1} == 0, 1), rounding_mode='floor').masked_fill({1} == 0, 0)"
+    ),
     "neg": "-{0}",
     "abs": "{0}.abs()",
     "min": "torch.minimum({0}, {1})",
@@ -146,21 +113,9 @@ _KERNELS: dict[str, str | Callable[..., str]] = {
 """The expression of each operation, with numbered arguments, or a function of the arguments' names."""
 
 
-def _significant_bits(pass_: PassGraph) -> dict[str, int]:
-    """The number of bits of each stream that the pass needs: all bits, unless every limit is a constant."""
-    needed: dict[str, int] = {}
-    for node in nodes_of(pass_):
-        if node.op in ("below", "draw"):
-            stream, own = node.attr
-            if node.args and node.args[0].op == "const" and (limit := int(node.args[0].attr)):
-                own -= min((limit & -limit).bit_length() - 1, own - 1)
-            needed[stream] = max(needed.get(stream, 1), own)
-    return needed
-
-
 def pass_source(pass_: PassGraph, number: int) -> tuple[str, str, dict[str, object]]:
     """Source, function name and constants of a pass. `number` makes the name unique."""
-    writer = _Writer(_significant_bits(pass_))
+    writer = _Writer()
     place = ""
     for node in nodes_of(pass_, substeps=False):
         if node.places and node.places[0] != place:
@@ -169,12 +124,11 @@ def pass_source(pass_: PassGraph, number: int) -> tuple[str, str, dict[str, obje
         writer.node(node)
     name = f"pass_{number}"
     returned = ", ".join(f"{slot!r}: k.full({writer.names[node]})" for slot, node in pass_.outputs)
-    header = [f"# {comment_of(pass_.name)}"] + [
-        f"# {key} = {value}" for key, value in writer.constants.items()
-    ]
+    constants = {key: value for (_, value), key in writer.constants.items()}
+    header = [f"# {comment_of(pass_.name)}", *[f"# {key} = {value}" for key, value in constants.items()]]
     lines = [f"    {line}" for line in with_deletions(writer.lines, returned)]
     source = "\n".join([*header, f"def {name}(k, state):", *lines, f"    return {{{returned}}}"])
-    return source + "\n", name, writer.constants
+    return source + "\n", name, constants
 
 
 def with_deletions(lines: list[str], returned: str) -> list[str]:
