@@ -10,6 +10,16 @@ import pytest
 from powderdsl.model.reference import neighborhood
 from powderdsl.model.types import Kernel
 from powderdsl.simulation.draw import to_numpy
+from tests.semantics.texts import simulator
+
+FLOATS = """\
+pack: floats
+elements: {air: {id: 0, color: '#000000'}, dust: {id: 1, color: '#111111'}}
+fields:
+  heat: {type: real(0..9), at: place}
+  wind: {type: vec2(-9..9), at: place}
+passes: {p: {do: air -> dust}}
+"""
 
 
 @pytest.mark.parametrize("wraps", [True, False])
@@ -32,3 +42,15 @@ def test_sums_of_slices(shape: tuple[int, int, int], largest: int, wraps: bool, 
         found = kernels.count(torch.from_numpy(flags), kernel.weights, wraps)
         assert found.dtype == torch.int32
         assert np.array_equal(to_numpy(found), neighborhood(flags.astype(np.int64), kernel))
+
+
+def test_new_worlds_share_no_memory_with_old_ones(torch: Any) -> None:
+    """Not even the planes that no pass has written: callers may write into them."""
+    cells = simulator(FLOATS, backend="torch-cells")
+    first = cells.world(torch.zeros((1, 3, 4), dtype=torch.uint8))
+    second = cells.step(first)
+    before = {name: plane.clone() for name, plane in first.state.items()}
+    for plane in second.state.values():
+        assert plane.is_contiguous()
+        plane.add_(1)
+    assert all(torch.equal(plane, before[name]) for name, plane in first.state.items())

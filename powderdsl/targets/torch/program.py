@@ -24,7 +24,8 @@ from powderdsl.targets.torch.source import load_source, pass_source
 
 PassFunction = Callable[[Any, dict[str, Tensor]], dict[str, Tensor]]
 
-_DTYPES = {"flag": torch.bool, "int": torch.int32, "real": torch.float32}
+DTYPES = {"flag": torch.bool, "int": torch.int32, "real": torch.float32}
+"""Of working planes, by type."""
 
 
 # Random numbers: the bit planes of each draw are hashes of (seed, world, step, stream, word). The same numbers as
@@ -155,7 +156,7 @@ class Kernels:
 
     def param(self, name: str, kind: str) -> Tensor:
         """A parameter's value [B, 1, 1]."""
-        return self.params[name][:, None, None].to(_DTYPES[kind])
+        return self.params[name][:, None, None].to(DTYPES[kind])
 
     def limit(self, name: str, bits: int, strict: bool) -> Tensor:
         """A parameter as a chance [B, 1, 1]: the number of possible draws below it, or not above it."""
@@ -195,7 +196,7 @@ class TorchProgram:
             base_keys(seed, index), self._idents, start, snap=self._snap,
         )  # fmt: skip
         planes = {  # in working dtypes: vectors split, integers widened
-            piece.slot: piece.of(job.state[piece.state]).to(_DTYPES[piece.type.name])
+            piece.slot: piece.of(job.state[piece.state]).to(DTYPES[piece.type.name])
             for parts in self._pieces.values()
             for piece in parts
         }
@@ -205,7 +206,7 @@ class TorchProgram:
                 for slot in self.program.slots:
                     if slot.resets:
                         planes[slot.name] = torch.full(
-                            kernels.shape, slot.default, dtype=_DTYPES[slot.type.name], device=self.device
+                            kernels.shape, slot.default, dtype=DTYPES[slot.type.name], device=self.device
                         )
                 job.tick("")
                 for name, function in self._functions:
@@ -217,9 +218,8 @@ class TorchProgram:
             parts = [kernels.full(planes[piece.slot]) for piece in self._pieces[name]]
             if self._pieces[name][0].component is not None:
                 packed[name] = torch.stack(parts, 1)
-            else:
-                new = parts[0].to(old.dtype)
-                packed[name] = new.clone() if new is old else new.contiguous()
+            else:  # a copy, also where no pass wrote the plane
+                packed[name] = parts[0].to(old.dtype, memory_format=torch.contiguous_format, copy=True)
         return packed
 
 

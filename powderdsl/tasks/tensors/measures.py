@@ -19,7 +19,7 @@ from powderdsl.simulation.simulator import World
 from powderdsl.targets.cpp.counts import CellCounts, Counted
 from powderdsl.targets.cpp.program import NativeProgram, PackedState
 from powderdsl.targets.tensor_kind import pack
-from powderdsl.targets.torch.program import Kernels, PassFunction, compiled
+from powderdsl.targets.torch.program import DTYPES, Kernels, PassFunction, compiled
 from powderdsl.targets.torch.source import pass_source
 from powderdsl.tasks.goals import REGION_LET, parts_of
 from powderdsl.tasks.task import NOTHING, Goal, Measure
@@ -213,14 +213,11 @@ class _Cells:
         for name in self.slots:
             vector, component = component_of(name)
             plane = world.state[name] if component is None else world.state[vector][:, component]
-            planes[name] = plane.to(_WORKING[self.types[name].name])
+            planes[name] = plane.to(DTYPES[self.types[name].name])
         for name in self.regions:
             planes[name] = regions[name.removeprefix(REGION_LET)]
         cells = self.run(kernels, planes)
         return {number: cells[f"measure {number}"] for number in self.numbers}
-
-
-_WORKING = {"flag": torch.bool, "int": torch.int32, "real": torch.float32}
 
 
 @dataclass(frozen=True)
