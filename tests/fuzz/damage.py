@@ -24,6 +24,7 @@ from powderdsl.system.reports import as_json
 from powderdsl.system.writing import replacing
 from powderdsl.testing.generators.cases import Choices
 from tests.fuzz.crew import Lost, work_through
+from tests.fuzz.grammar import weighted
 from tests.fuzz.rulemaker import Manner, ruleset_text
 
 HANGS = 300
@@ -133,8 +134,8 @@ def _damaged(choices: Choices, parts: list[str]) -> str:
 
 
 def _character(choices: Choices) -> str:
-    code = choices.weighted(
-        [(3, 32 + choices.below(95)), (2, ord(choices.pick(ODD))), (1, choices.below(0xD800))]
+    code = weighted(
+        choices, [(3, 32 + choices.below(95)), (2, ord(choices.pick(ODD))), (1, choices.below(0xD800))]
     )
     return chr(code)
 
@@ -223,7 +224,7 @@ class Trial:
 def damaged_text(seed: int) -> tuple[str, str]:
     """Kind and text of the input of a seed."""
     choices = Choices.seeded(seed)
-    kind = choices.weighted([(weight, name) for name, (weight, _) in KINDS.items()])
+    kind = weighted(choices, [(weight, name) for name, (weight, _) in KINDS.items()])
     return kind, KINDS[kind][1](choices)
 
 

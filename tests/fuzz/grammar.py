@@ -8,13 +8,15 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import TypeVar
 
 from powderdsl.model.builtins import MAX_MAGNITUDE
 from powderdsl.testing.generators.cases import Choices
 
+T = TypeVar("T")
 Reach = Callable[[list[float]], float]
 
 HOLE = re.compile(r"\{(?:(\w+)=)?([\w ]+)\}")
@@ -30,6 +32,16 @@ def largest(reaches: list[float]) -> float:
 
 REACHES: dict[str, Reach] = {"": largest, "*": math.prod, "+": math.fsum}
 """By the sign after a weight."""
+
+
+def weighted(choices: Choices, rows: Sequence[tuple[int, T]]) -> T:
+    """One of the options, each as likely as its weight says."""
+    number = choices.below(sum(weight for weight, _ in rows))
+    for weight, option in rows:
+        if number < weight:
+            return option
+        number -= weight
+    raise AssertionError("weights must not be negative")
 
 
 @dataclass(frozen=True)
@@ -299,7 +311,7 @@ class Phrases:
             return self.makers[kind](self, depth)
         rows = [row for row in self.grammar.get(kind, ()) if depth > 0 or not row.nests]
         while rows:
-            row = self.choices.weighted([(row.weight, row) for row in rows])
+            row = weighted(self.choices, [(row.weight, row) for row in rows])
             phrase = self.filled(row, depth - row.nests)
             if phrase is not None and phrase.reach <= LIMIT:
                 return phrase

@@ -20,6 +20,7 @@ from tests.fuzz.grammar import (
     Production,
     flag_of_a_loop,
     productions,
+    weighted,
 )
 from tests.semantics.texts import load_text
 
@@ -64,9 +65,9 @@ class Vocabulary:
         """The declarations as sections of a rule file; those without entries are left out."""
         choices = self.choices
         last = -1
-        for i in range(choices.weighted([(2, 1), (4, 2), (3, 3), (3, 4), (1, 6), (1, 9)])):
+        for i in range(weighted(choices, [(2, 1), (4, 2), (3, 3), (3, 4), (1, 6), (1, 9)])):
             self.elements.append(f"e{i}")
-            last += choices.weighted([(12, 1), (2, 2), (1, 5)])
+            last += weighted(choices, [(12, 1), (2, 2), (1, 5)])
             self.ids.append(last)
             self._bind(f"e{i}", "known element", "element word")
         if choices.maybe(3):
@@ -95,7 +96,7 @@ class Vocabulary:
 
     def _numbers(self, *weights: int) -> range:
         """Numbers of some declarations: how many there are is as likely as its weight, from 0 on."""
-        return range(self.choices.weighted([(weight, count) for count, weight in enumerate(weights)]))
+        return range(weighted(self.choices, [(weight, count) for count, weight in enumerate(weights)]))
 
     def _bind(self, name: str, *kinds: str, reach: float = 0) -> None:
         self.phrases = self.phrases.bound(name, *kinds, reach=reach)
@@ -111,7 +112,7 @@ class Vocabulary:
 
     def _property(self, name: str) -> Tree:
         choices = self.choices
-        kind = choices.weighted([(4, integer(0, 7)), (3, FLAG), (2, CHANCE), (2, some_range(choices))])
+        kind = weighted(choices, [(4, integer(0, 7)), (3, FLAG), (2, CHANCE), (2, some_range(choices))])
         self.properties[name] = kind
         self._bind(name, f"{kind.name} property", f"{kind.name} name", reach=kind.reach)
         return str(kind) if choices.maybe(30) else {"type": str(kind), "default": self._literal(kind)}
@@ -120,7 +121,7 @@ class Vocabulary:
         choices = self.choices
         bound = choices.pick([100, 1, 1000, 2])
         floats = [(3, Kind("real", choices.pick([-bound, 0]), bound)), (3, Kind("vec2", -bound, bound))]
-        kind = choices.weighted([(4, some_range(choices)), (3, FLAG), (2, ELEMENT), (2, DIRECTION), *floats])
+        kind = weighted(choices, [(4, some_range(choices)), (3, FLAG), (2, ELEMENT), (2, DIRECTION), *floats])
         self.fields[name] = kind
         self._bind(name, f"{kind.name} field", f"{kind.name} name", reach=kind.reach)
         entry: dict[str, Tree] = {"type": str(kind), "at": choices.pick(["element", "place"])}
@@ -232,7 +233,7 @@ def ruleset_text(choices: Choices, manner: Manner) -> str:
     words = Vocabulary(choices, manner, Phrases(choices, grammar, {"flag of a loop": flag_of_a_loop}))
     sections = words.sections()
     passes: dict[str, Tree] = {}
-    for i in range(choices.weighted([(3, 1), (3, 2), (2, 3)])):
+    for i in range(weighted(choices, [(3, 1), (3, 2), (2, 3)])):
         passes[f"pass{i}"] = PassMaker(choices, words, manner, i).tree(list(passes))
     return write_yaml({"pack": "random", **sections, "passes": passes})
 
@@ -264,7 +265,7 @@ class PassMaker:
         makers = {form: partial(self._update, form) for form in ("update", "effect")}
         phrases = self.words.phrases
         phrases = replace(phrases, makers={**phrases.makers, **makers})
-        for _ in range(choices.weighted([(4, 0), (2, 1), (1, 2)])):
+        for _ in range(weighted(choices, [(4, 0), (2, 1), (1, 2)])):
             kinds = [some_range(choices), FLAG, DIRECTION, Kind("real", -50, 50), Kind("vec2", -9, 9)]
             kind = choices.pick([*kinds, ELEMENT] if 0 in self.words.ids else kinds)
             name = self._name("x")
@@ -291,9 +292,10 @@ class PassMaker:
             symmetric = True
             tree["symmetry"] = choices.pick(["mirror", "rotations", "all"])
         lets: dict[str, Tree] = {}
-        for _ in range(choices.weighted([(4, 0), (3, 1), (1, 2)])):
-            kind = choices.weighted(
-                [(6, FLAG), (3, some_range(choices)), (2, ELEMENT), (2, DIRECTION), (2, REAL), (2, VEC2)]
+        for _ in range(weighted(choices, [(4, 0), (3, 1), (1, 2)])):
+            kind = weighted(
+                choices,
+                [(6, FLAG), (3, some_range(choices)), (2, ELEMENT), (2, DIRECTION), (2, REAL), (2, VEC2)],
             )
             value = (
                 clamped(phrases, kind) if kind.name == "int" else phrases.draw(f"{kind.name} let value", 2)
@@ -324,14 +326,14 @@ class PassMaker:
     def _header(self, phrases: Phrases, rounds: int) -> tuple[str, Phrases, int]:
         """`do`, `for …` or `repeat …`, what is known inside, and how much unrolling is left."""
         choices = self.choices
-        form = choices.weighted([(6, "do"), (4, "for"), (1, "repeat")])
+        form = weighted(choices, [(6, "do"), (4, "for"), (1, "repeat")])
         if form == "repeat" and rounds >= 3:
             times = choices.integer(1, 3)
             return f"repeat {times}", phrases, rounds // times
         if form != "for" or rounds < 4:
             return "do", phrases, rounds
         bindings = []
-        for _ in range(choices.weighted([(4, 1), (1, 2)]) if rounds >= 8 else 1):
+        for _ in range(weighted(choices, [(4, 1), (1, 2)]) if rounds >= 8 else 1):
             binding, phrases = phrases.looping(self._name("i"))
             bindings.append(binding)
             rounds //= 4
@@ -345,8 +347,8 @@ class PassMaker:
         kinds = []
         if policy is not None:
             rows = [(weight, form) for form, weight in WEIGHTS.items() if form in forms]
-            count = choices.weighted([(3, 1), (3, 2), (2, 3), (1, 5)])
-            kinds = [choices.weighted(rows) for _ in range(count)]
+            count = weighted(choices, [(3, 1), (3, 2), (2, 3), (1, 5)])
+            kinds = [weighted(choices, rows) for _ in range(count)]
         else:
             movers = [form for form in ("transform", "swap", "move") if form in forms]
             if symmetric:

@@ -51,15 +51,6 @@ class Choices:
                 picked.append(option)
         return picked
 
-    def weighted(self, rows: Sequence[tuple[int, T]]) -> T:
-        """One of the options, each as likely as its weight says."""
-        number = self.below(sum(weight for weight, _ in rows))
-        for weight, option in rows:
-            if number < weight:
-                return option
-            number -= weight
-        raise AssertionError("weights must not be negative")
-
 
 Array = np.ndarray[Any, Any]
 
