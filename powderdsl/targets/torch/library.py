@@ -221,10 +221,6 @@ class Portable:
         """Cells as an array [..., B, H, W]."""
         return cells.movedim(-1, -3)
 
-    def each_world(self, value: Tensor) -> Tensor:
-        """A number of each world [B] for cells."""
-        return value[None, None]
-
     def bits(self, plane: Tensor) -> Tensor:
         """The flags of each cell, as integers 0 and 1."""
         words = self.whole(plane).movedim(-1, -2)[..., None, :]  # [..., H, K, 1, B]: worlds are innermost
@@ -374,9 +370,6 @@ class Eager(Portable):
 
     def from_cells(self, cells: Tensor) -> Tensor:
         return cells.movedim(-3, -2)
-
-    def each_world(self, value: Tensor) -> Tensor:
-        return value[None, :, None]
 
     def bits(self, plane: Tensor) -> Tensor:
         return self._expanded(plane, _BITS)
