@@ -143,6 +143,16 @@ def clear(folder: Path) -> list[Entry]:
     return removed
 
 
+def fused_code(*, remove: bool = False) -> list[Entry]:
+    """What the backend `torch-fused` keeps in a folder of its own, as one entry; none if there is nothing."""
+    folder = cache_folder("inductor")
+    sizes = [path.lstat().st_size for path in folder.rglob("*") if path.is_file()]
+    stored = [Entry(folder, "torch-fused", sum(sizes), folder.stat().st_mtime)] if sizes else []
+    if remove:
+        _discard(folder)
+    return stored
+
+
 def tidy(folder: Path, limit: int = LIMIT, keep: Path | None = None) -> None:
     """Remove old leftovers and, beyond `limit` bytes or `MOST` files, the files used longest ago, except `keep`."""
     stored = entries(folder)

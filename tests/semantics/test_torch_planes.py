@@ -176,14 +176,46 @@ def test_random_rules_compiled(seed: int) -> None:
     agreed([run_seed(seed, Plan(("torch-fused",), worlds=1, steps=2))])
 
 
-def test_settings_of_exactness_exist() -> None:
-    """Inductor refuses options that it does not know; here each is named."""
+def test_settings_of_exactness() -> None:
+    """Inductor refuses options that it does not know; here each is named. Why each is needed: docs/compiler.md."""
     import torch._inductor.config as config
 
     from powderdsl.targets.torch.fuse import SETTINGS
 
     assert set(SETTINGS) <= set(config.get_config_copy())
-    assert SETTINGS["cpp.enable_floating_point_contract_flag"] == "off"
+    exact = {name: value for name, value in SETTINGS.items() if "threshold" not in name}
+    assert exact == {
+        "cpp.enable_floating_point_contract_flag": "off",
+        "emulate_precision_casts": True,
+        "eager_numerics.division_rounding": True,
+        "eager_numerics.disable_ftz": True,
+    }
+
+
+def test_settings_of_exactness_reach_triton() -> None:
+    """What they do to kernels of a GPU, in inductor's own source: no GPU is needed to read it."""
+    import torch._inductor.codegen.triton as triton
+
+    source = Path(str(triton.__file__)).read_text()
+    assert '"enable_fp_fusion": not config.emulate_precision_casts' in source
+    assert '"disable_ftz": config.eager_numerics.disable_ftz' in source
+    assert "div_rn(" in source[source.index("config.eager_numerics.division_rounding") :][:400]
+
+
+def test_compiled_functions_are_kept_in_our_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Not in a folder in /tmp, whose name everybody knows: torch sets that when it is imported."""
+    from torch._inductor.runtime.cache_dir_utils import cache_dir
+
+    from powderdsl.targets.torch.fuse import fused
+
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.delenv("TORCHINDUCTOR_CACHE_DIR", raising=False)
+    assert not Path(cache_dir()).is_relative_to(tmp_path)
+    fused(lambda number: number)
+    assert cache_dir() == str(tmp_path / "powderdsl" / "inductor")
+    monkeypatch.setenv("TORCHINDUCTOR_CACHE_DIR", str(tmp_path / "mine"))
+    fused(lambda number: number)
+    assert cache_dir() == str(tmp_path / "mine")
 
 
 def test_a_missing_compiler_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -19,7 +19,7 @@ import pytest
 from filelock import FileLock
 
 from powderdsl.system import cache
-from powderdsl.system.writing import MARK, scratch_folder
+from powderdsl.system.writing import MARK, cache_folder, scratch_folder
 from powderdsl.targets.cpp.build import (
     Building,
     Compiler,
@@ -352,6 +352,25 @@ def test_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert not names(folder)
     folder.chmod(0o777)
     assert "others may write" in powderdsl("cache", "list", exits=2).stderr
+
+
+def test_fused_code_is_one_line_and_cleared(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    folder = cache_folder("inductor")
+    for name in ("ab/kernel.cpp", "fxgraph/cd/graph"):
+        (folder / name).parent.mkdir(parents=True)
+        (folder / name).write_bytes(bytes(1 << 20))
+    os.utime(folder, (0, 0))
+    put(cache.compiled_folder(), "fedcba", bytes(10))
+    listed = powderdsl("cache", "list")
+    assert [line.split()[:3] for line in listed.stdout.splitlines()[1:]] == [
+        ["core+yard", "0.0", "MB"],
+        ["torch-fused", "2.1", "MB"],
+    ]
+    assert "1970-01-01" in listed.stdout
+    assert "removed 2 files, 2.1 MB" in powderdsl("cache", "clear").stderr
+    assert not folder.exists()
+    assert "no files" in powderdsl("cache", "list").stderr
 
 
 def test_kernels_for_gpus_lie_there_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import click
 
 from powderdsl.cli.output import counted
-from powderdsl.system.cache import Entry, clear, compiled_folder, entries
+from powderdsl.system.cache import Entry, clear, compiled_folder, entries, fused_code
 from powderdsl.system.reports import table
 
 
@@ -17,14 +17,14 @@ def command() -> None:
     """List or remove the compiled code that this machine keeps, or print its folder.
 
     Rules are checked, lowered and compiled once for each version of their text. The results are private to the user.
-    Beyond 512 MB, those that were used least recently are removed.
+    Beyond 512 MB, those that were used least recently are removed, except what `torch-fused` has compiled.
     """
 
 
 @command.command("list")
 def list_entries() -> None:
-    """List the files of compiled code, the most recently used first."""
-    stored = entries(compiled_folder())
+    """List the files of compiled code, the most recently used first; `torch-fused` has one line for all of its own."""
+    stored = sorted([*entries(compiled_folder()), *fused_code()], key=lambda entry: -entry.used)
     rows = [["code of", "size", "last used"]]
     for entry in stored:
         used = time.strftime("%Y-%m-%d %H:%M", time.localtime(entry.used))
@@ -37,7 +37,7 @@ def list_entries() -> None:
 @command.command("clear")
 def clear_entries() -> None:
     """Remove compiled code. Running programs continue; code is compiled again when it is next needed."""
-    removed = clear(compiled_folder())
+    removed = [*clear(compiled_folder()), *fused_code(remove=True)]
     click.echo(f"removed {counted(len(removed), 'file')}, {_megabytes(removed)}", err=True)
 
 

@@ -8,10 +8,13 @@ from typing import Any
 
 import torch
 import torch._dynamo.exc
+from torch._inductor.runtime.cache_dir_utils import default_cache_dir
 
 from powderdsl.diagnostics import CompileError
 from powderdsl.system.writing import cache_folder
 from powderdsl.targets.job import unavailable
+
+FOLDER = "TORCHINDUCTOR_CACHE_DIR"
 
 SETTINGS: dict[str, Any] = {
     # Planes are read many times. Beyond these numbers they are stored; inductor's own make code that grows with the square.
@@ -31,7 +34,9 @@ def fused(function: Callable[..., Any]) -> Callable[..., Any]:
 
     Raises CompileError (PD701) on that call if it cannot be compiled.
     """
-    os.environ.setdefault("TORCHINDUCTOR_CACHE_DIR", str(cache_folder("inductor")))
+    os.utime(folder := cache_folder("inductor"))  # `powderdsl cache` shows when it was last used
+    if os.environ.get(FOLDER) in (None, default_cache_dir()):  # importing inductor sets the default, in /tmp
+        os.environ[FOLDER] = str(folder)
     compiled = torch.compile(function, fullgraph=True, dynamic=False, options=SETTINGS)
 
     def run(*args: Any) -> Any:
