@@ -31,6 +31,7 @@ from powderdsl.diagnostics import with_suggestion
 from powderdsl.model.state import check_sides
 from powderdsl.model.types import Element, Field, Ruleset
 from powderdsl.system.reports import table
+from powderdsl.targets.job import now
 from powderdsl.worlds.raster import Size, mask
 from powderdsl.worlds.strewn import check_cells, random_shape
 
@@ -80,8 +81,8 @@ class Plan:
     """All that a measurement depends on: the cross product of backends and programs, sizes, threads and batches.
 
     A sample is as many calls of `Simulator.step` as fit into ``seconds / rounds``, each of up to `steps` steps
-    from the same worlds. `workload` is one of `WORKLOADS`, `only` names the elements on the ground, and `profile`
-    times each pass too.
+    from the same worlds. `workload` is one of `WORKLOADS`, `only` names the elements on the ground, `profile` times
+    each pass too, and `check` compares each backend with another one on the CPU and counts its kernels.
 
     Raises:
         ValueError: an unknown element, a size that the rules do not take, or a program's name that is taken.
@@ -101,6 +102,7 @@ class Plan:
     seconds: float = 2.0
     rounds: int = 5
     profile: bool = False
+    check: bool = False
     programs: Sequence[Program] = ()
 
     def __post_init__(self) -> None:
@@ -230,6 +232,22 @@ def _located(path: Path) -> Iterator[None]:
 
 # Measuring
 
+EQUAL = "equal"
+
+
+def disagreement(world: World, other: World, most: int = 8) -> str:
+    """The first place where two simulators differ, in calls of up to `most` steps; empty if they are equal."""
+    ahead, wanted = world, other
+    for steps in range(1, most + 1):
+        ahead, wanted = (one.sim.step(one) for one in (ahead, wanted))
+        for end, name in product((ahead, world.sim.step(world, steps)), wanted.state):
+            values = [one.state[name].cpu().numpy() for one in (end, wanted)]
+            for place in np.argwhere(values[0] != values[1])[:1]:
+                index, *_, row, column = place.tolist()
+                found = " instead of ".join(str(array[tuple(place)]) for array in values)
+                return f"{name} of world {index}, cell ({row}, {column}), step {steps}: {found}"
+    return ""
+
 
 @dataclass
 class CellFigures:
@@ -237,17 +255,20 @@ class CellFigures:
 
     `compile_seconds` are its backend's, shared by all cells that have it. `passes` has the microseconds a world and step
     of each pass, in the order they run; it is empty if passes were not profiled. Processor times count all threads
-    together; other processes hardly affect them.
+    together; other processes hardly affect them. `check` is ``equal``, the first difference, or the error that ended the
+    measurement, without rounds; it is empty if nothing was compared. `kernels_per_step` are events of torch's profiler.
     """
 
     cell: Cell
-    compile_seconds: float
+    compile_seconds: float = 0.0
     first_step_seconds: float = 0.0
     steps_per_call: int = 1
     calls_per_round: int = 1
     round_seconds: list[float] = field(default_factory=list)
     round_processor_seconds: list[float] = field(default_factory=list)
     passes: dict[str, float] = field(default_factory=dict)
+    check: str = ""
+    kernels_per_step: float | None = None
 
     @property
     def world_steps(self) -> int:
@@ -281,18 +302,19 @@ class Report:
         """The processor time of a cell divided by that of a program for the same worlds; None if it is unknown."""
         same = figures.cell._replace(backend=program)
         times = [other.processor_microseconds for other in self.cells if other.cell == same]
-        return figures.processor_microseconds / times[0] if times and times[0] else None
+        return figures.processor_microseconds / times[0] if figures.rates and times and times[0] else None
 
 
 def measuring(plan: Plan, cells: list[CellFigures]) -> Iterator[tuple[str, Cell]]:
     """Measure a plan part by part; yields the kind of part and its cell.
 
-    Parts are ``compile`` and ``profile``, which begin now, and ``measure``, a sample that is done. Figures of each
-    cell are added to `cells`. Torch's number of threads is that of
-    each cell while this runs. Raises CompileError (PD701) for a backend or device that is not available.
+    Parts are ``compile``, which includes checks, and ``profile``, which begin now, and ``measure``, a sample that is done.
+    Figures of each cell are added to `cells`. Torch's number of threads is that of each cell while this runs. Raises
+    CompileError (PD701) for a backend or device that is not available; with `check`, figures have the errors instead.
     """
     import torch
 
+    from powderdsl.simulation.programs import starting_backend
     from powderdsl.simulation.simulator import compile
 
     @cache
@@ -300,33 +322,52 @@ def measuring(plan: Plan, cells: list[CellFigures]) -> Iterator[tuple[str, Cell]
         began = time.perf_counter()
         return compile(plan.ruleset, backend, device, threads), time.perf_counter() - began
 
+    @contextmanager
+    def running(figures: CellFigures) -> Iterator[None]:
+        """With the threads of a cell. If backends are checked, an error of one is kept, and the others still run."""
+        torch.set_num_threads(figures.cell.threads)
+        try:
+            yield
+        except Exception as error:
+            if not plan.check or figures.cell.backend in programs:
+                raise
+            lines = [line for one in getattr(error, "diagnostics", ()) for line in (one.message, *one.notes)]
+            figures.check = ": ".join(filter(None, lines)) or f"{type(error).__name__}: {error}"
+
     threads, programs = torch.get_num_threads(), {program.name: program for program in plan.programs}
     subjects: list[_Subject] = []
     try:
         for cell in plan.cells:
             yield "compile", cell
-            torch.set_num_threads(cell.threads)
-            program = programs.get(cell.backend)
-            if program is None:
-                sim, seconds = compiled(cell.backend, plan.device, cell.threads)
-            else:
-                sim, seconds = compiled("reference", "cpu", 1)[0], 0.0
-            subject = _Subject(sim, start_worlds(sim, plan, cell), program, CellFigures(cell, seconds))
-            subject.begin(plan)
-            subjects.append(subject)
-            cells.append(subject.figures)
+            program, figures = programs.get(cell.backend), CellFigures(cell)
+            cells.append(figures)
+            with running(figures):
+                if program is None:
+                    sim, figures.compile_seconds = compiled(cell.backend, plan.device, cell.threads)
+                else:
+                    sim = compiled("reference", "cpu", 1)[0]
+                subject = _Subject(sim, start_worlds(sim, plan, cell), program, figures)
+                subject.begin(plan)
+                if plan.check and program is None:
+                    plain = cell.backend != "wasm" and starting_backend("cpu") == "wasm"
+                    other = compile(plan.ruleset, "wasm" if plain else "torch-cells")
+                    worlds = start_worlds(sim, plan, cell), start_worlds(other, plan, cell)
+                    figures.check = disagreement(*worlds) or EQUAL
+                    if sim.backend in ("torch", "torch-cells", "torch-fused", "cuda"):
+                        figures.kernels_per_step = subject.kernels(figures.steps_per_call)
+                subjects.append(subject)
         for _ in range(plan.rounds):
             for subject in subjects:
                 figures = subject.figures
-                torch.set_num_threads(figures.cell.threads)
-                seconds, processor_seconds = subject.timed(figures.steps_per_call, figures.calls_per_round)
-                figures.round_seconds.append(seconds)
-                figures.round_processor_seconds.append(processor_seconds)
+                with running(figures):
+                    spent = subject.timed(figures.steps_per_call, figures.calls_per_round)
+                    figures.round_seconds.append(spent[0])
+                    figures.round_processor_seconds.append(spent[1])
                 yield "measure", figures.cell
         for subject in subjects if plan.profile else ():
             yield "profile", subject.figures.cell
-            torch.set_num_threads(subject.figures.cell.threads)
-            subject.profile()
+            with running(subject.figures):
+                subject.profile()
     finally:
         torch.set_num_threads(threads)
 
@@ -360,26 +401,29 @@ class _Subject:
         seconds = processor_seconds = 0.0
         for _ in range(loads):
             run = self._load()
-            began, busy = time.perf_counter(), time.process_time()
+            began, busy = now(self.sim.device), time.process_time()
             for _ in range(calls // loads):
                 run(steps)
-            self._wait()
-            seconds += time.perf_counter() - began
+            seconds += now(self.sim.device) - began
             processor_seconds += time.process_time() - busy
         return seconds, processor_seconds
 
     def _load(self) -> Run:
-        self._wait()
         if self.program is None:
             return lambda steps: self.sim.step(self.world, steps)
         return self.program.load({name: values.numpy().copy() for name, values in self.world.state.items()})
 
-    def _wait(self) -> None:
-        """Wait for what a GPU still has to do."""
-        if self.sim.device.type == "cuda":
-            import torch
+    def kernels(self, steps: int) -> float:
+        """What torch's profiler sees of a step: a GPU's kernels and copies, or operators that call no others on the CPU."""
+        os.environ.setdefault("KINETO_LOG_LEVEL", "99")  # otherwise it writes on stderr
+        from torch.profiler import ProfilerActivity, profile
 
-            torch.cuda.synchronize(self.sim.device)
+        kind = ProfilerActivity.CPU if self.sim.device.type == "cpu" else ProfilerActivity.CUDA
+        with profile(activities=[kind]) as trace:
+            self.sim.step(self.world, steps)
+            now(self.sim.device)
+        events = [one for one in trace.events() if one.device_type.name == kind.name]
+        return sum(not (one.cpu_children or one.is_user_annotation) for one in events) / steps
 
     def profile(self) -> None:
         """Measure the microseconds a world and step of each pass, if the backend can report them."""
@@ -403,11 +447,9 @@ def this_machine(device: str) -> dict[str, Any]:
     from powderdsl.simulation.programs import find_device
     from powderdsl.targets.cpp.build import NoCompiler, find_compiler
 
-    kind = find_device(device)
-    try:
+    kind, compiler = find_device(device), "none"
+    with suppress(NoCompiler):
         compiler = find_compiler().version
-    except NoCompiler:
-        compiler = "none"
     processor = platform.processor() or platform.machine()
     with suppress(OSError):
         if model := re.search(r"^model name\s*: (.+)$", Path("/proc/cpuinfo").read_text(), re.MULTILINE):
@@ -433,7 +475,7 @@ def report_data(report: Report) -> dict[str, Any]:
     for figures in report.cells:
         values = figures.cell._asdict() | vars(figures)
         del values["cell"]
-        values["world_steps_per_second"] = median(figures.rates)
+        values["world_steps_per_second"] = median(figures.rates) if figures.rates else None
         values["beside"] = {program.name: report.ratio(figures, program.name) for program in plan.programs}
         cells.append(values)
     return {
@@ -454,13 +496,15 @@ def report_text(report: Report) -> str:
         "{processor}, {cpus} CPUs, device {device}".format_map(machine),
     ]
     parts = ["\n".join(header)]
-    steps = sorted({figures.steps_per_call for figures in report.cells})
+    steps = sorted({figures.steps_per_call for figures in report.cells if figures.rates}) or [1]
     shown = str(steps[0]) if len(steps) == 1 else f"{steps[0]} to {steps[-1]}"
     notes = [
         f"medians of {plan.rounds} interleaved rounds; a call makes {shown} steps, always from the same worlds",
         "CPUs: processor time by time; less than the threads means that others were at work",
         "to first step: compiling, which all lines of a backend share, and the first step",
     ]
+    if plan.check:
+        notes.append("kernels/step: with copies, on a GPU; on the CPU, operators that call no others")
     if plan.programs:
         notes.append("÷: processor time divided by that of another program, from the same worlds")
     parts += [_cell_table(report), "\n".join(notes)]
@@ -473,24 +517,21 @@ def _cell_table(report: Report) -> str:
     """One line per cell, and a column for each program beside the backends."""
     titles = ["backend", "batch", "size", "threads", "world-steps/s", "slowest..fastest", "µs/world-step"]
     programs = [program.name for program in report.plan.programs]
-    rows = [[*titles, "CPUs", "to first step", *(f"÷ {name}" for name in programs)]]
+    checks = ["kernels/step", "check"] if report.plan.check else []
+    rows = [[*titles, "CPUs", "to first step", *(f"÷ {name}" for name in programs), *checks]]
     for figures in report.cells:
-        cell, rates, spent = figures.cell, figures.rates, figures.world_step_microseconds
+        cell, rates = figures.cell, figures.rates
+        row = [cell.backend, f"{cell.batch:,}", f"{cell.size[0]}×{cell.size[1]}", str(cell.threads)]
+        if rates:
+            spent = figures.world_step_microseconds
+            row += [number(median(rates)), f"{number(rates[0])}..{number(rates[-1])}", number(spent)]
+            row.append(f"{figures.processor_microseconds / spent:.2f}")
+            row.append(f"{figures.compile_seconds + figures.first_step_seconds:.2f} s")
+        row += ["–"] * (len(titles) + 2 - len(row))
         ratios = [report.ratio(figures, name) for name in programs]
-        rows.append(
-            [
-                cell.backend,
-                f"{cell.batch:,}",
-                f"{cell.size[0]}×{cell.size[1]}",
-                str(cell.threads),
-                number(median(rates)),
-                f"{number(rates[0])}..{number(rates[-1])}",
-                number(spent),
-                f"{figures.processor_microseconds / spent:.2f}",
-                f"{figures.compile_seconds + figures.first_step_seconds:.2f} s",
-                *("?" if ratio is None else number(ratio) for ratio in ratios),
-            ]
-        )
+        row += ["?" if ratio is None else number(ratio) for ratio in ratios]
+        kernels = "" if figures.kernels_per_step is None else number(figures.kernels_per_step)
+        rows.append([*row, kernels, " ".join(figures.check.split())[:200]][: len(rows[0])])
     return "\n".join(table(rows, indent=""))
 
 
@@ -506,8 +547,7 @@ def _pass_table(profiled: Sequence[CellFigures]) -> str:
         "whole step": [figures.world_step_microseconds for figures in profiled],
         "of that, processor time": [figures.processor_microseconds for figures in profiled],
     }
-    for name, values in wholes.items():
-        rows.append([name, *(f"{number(value)}     " for value in values)])
+    rows += [[name, *(f"{number(value)}     " for value in values)] for name, values in wholes.items()]
     return "\n".join(table(rows, indent=""))
 
 

@@ -14,31 +14,31 @@ from powderdsl.system.writing import failure
 from powderdsl.targets.array_kind import Array
 
 
+def now(device: Any) -> float:
+    """The time in seconds, once a GPU has done what it was asked to: it works asynchronously."""
+    if getattr(device, "type", "") == "cuda":
+        import torch
+
+        torch.cuda.synchronize(device)
+    return time.perf_counter()
+
+
 class PassClock:
     """Seconds by pass. Work before the first pass has the name ``""``."""
 
     def __init__(self, device: Any):
         self._device = device
         self.seconds: defaultdict[str, float] = defaultdict(float)
-        self._last = self._now()
+        self._last = now(device)
 
     def tick(self, name: str) -> None:
         """Count the time since the last call for a pass."""
-        now = self._now()
-        self.seconds[name] += now - self._last
-        self._last = now
+        last, self._last = self._last, now(self._device)
+        self.seconds[name] += self._last - last
 
     def add(self, name: str, seconds: float) -> None:
         """Count time that a program measured itself."""
         self.seconds[name] += seconds
-
-    def _now(self) -> float:
-        # A GPU works asynchronously: without waiting, the time would count for a later pass.
-        if getattr(self._device, "type", "") == "cuda":
-            import torch
-
-            torch.cuda.synchronize(self._device)
-        return time.perf_counter()
 
 
 class Clock(NamedTuple):

@@ -93,6 +93,19 @@ def test_all_cells_are_ready_before_the_first_round_and_costs_come_last(torch):
     assert kinds == ["compile"] * 4 + ["measure"] * 8 + ["profile"] * 4
 
 
+def test_a_backend_that_fails_in_a_round_does_not_end_the_others(torch, monkeypatch):
+    plan = Plan(powderdsl.load("life"), backends=["torch", "wasm"], check=True, **{**TINY, "batches": [1]})
+    figures = []
+    parts = measuring(plan, figures)
+    assert next(kind for kind, _ in parts if kind == "measure")
+    monkeypatch.setattr("powderdsl.targets.torch.packed.PlanesProgram.run", lambda self, job: 1 // 0)
+    assert len(list(parts)) == 3
+    assert [(one.check.split(":")[0], len(one.round_seconds)) for one in figures] == [
+        ("ZeroDivisionError", 1),
+        ("equal", 2),
+    ]
+
+
 def test_torch_has_its_threads_back(rules, torch):
     before = torch.get_num_threads()
     parts = measuring(Plan(rules, backends=["torch"], threads=[before + 1], **TINY), [])

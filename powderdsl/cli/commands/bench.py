@@ -9,9 +9,10 @@ from typing import Any
 import click
 
 from powderdsl.cli import options as opt
-from powderdsl.cli.exits import OK, user_values
+from powderdsl.cli.exits import FAILED, OK, user_values
 from powderdsl.cli.output import print_json, progress
 from powderdsl.experiments.bench import (
+    EQUAL,
     WORKLOADS,
     CellFigures,
     Plan,
@@ -44,7 +45,7 @@ EPILOG = "\b\nWorkloads:\n" + "\n".join(f"  {name:<7} {about}" for name, about i
 @opt.option(
     "--backend",
     opt.BACKEND,
-    "Backend that runs the rules.  [default: wasm and native; on a GPU, torch and cuda]",
+    "Backend that runs the rules.  [default: wasm and native; on a GPU, torch and cuda, with --check torch-fused too]",
     to="backends",
     multiple=True,
 )
@@ -68,6 +69,7 @@ EPILOG = "\b\nWorkloads:\n" + "\n".join(f"  {name:<7} {about}" for name, about i
 @opt.option("--seed", (0, 2**63 - 1), "Seed of the start worlds.", Plan.seed)
 @opt.parameters
 @opt.option("--profile", bool, "Also measure the time of each pass.")
+@opt.option("--check", bool, "Compare with the CPU, count kernels, and exit with 1 on a difference.")
 @opt.option("--json", bool, "Print one JSON object instead of tables.", to="printed")
 def command(
     rules: str,
@@ -82,13 +84,13 @@ def command(
     """Measure how fast rules run.
 
     --backend, --batch, --size and --threads may be repeated. All their combinations are measured, in
-    turn, round after round, and medians are shown.
+    turn, round after round, and medians are shown. With --check, a backend that does not run gets a row that says why.
     """
     ruleset = opt.load_rules(rules, settings)
     with user_values():
         plan = Plan(
             ruleset,
-            backends=backends or _usual_backends(device),
+            backends=backends or _usual_backends(device, measurement["check"]),
             sizes=sizes or ((fitting(ruleset, 64),) * 2,),
             device=device,
             programs=[read_program(file) for file in programs],
@@ -104,16 +106,16 @@ def command(
         print_json(report_data(report))
     else:
         click.echo(report_text(report))
-    return OK
+    return OK if all(one.check in ("", EQUAL) for one in figures) else FAILED
 
 
-def _usual_backends(device: str) -> tuple[str, ...]:
-    """The default backends: the one that starts at once, and the fastest one for the device if it can be compiled."""
+def _usual_backends(device: str, check: bool) -> tuple[str, ...]:
+    """The default backends: the one that starts at once, and the fastest for the device; to `check` a GPU, all there are."""
     from powderdsl.simulation.programs import starting_backend
 
     first = starting_backend(device)
     if device != "cpu":
-        return ("torch", "cuda") if device.startswith("cuda") else ("torch",)
+        return ("torch", *("torch-fused",) * check, *("cuda",) * device.startswith("cuda"))
     try:
         find_compiler()
     except NoCompiler as error:
