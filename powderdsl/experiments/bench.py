@@ -348,6 +348,7 @@ def measuring(plan: Plan, cells: list[CellFigures]) -> Iterator[tuple[str, Cell]
                     sim = compiled("reference", "cpu", 1)[0]
                 subject = _Subject(sim, start_worlds(sim, plan, cell), program, figures)
                 subject.begin(plan)
+                subjects.append(subject)
                 if plan.check and program is None:
                     plain = cell.backend != "wasm" and starting_backend("cpu") == "wasm"
                     other = compile(plan.ruleset, "wasm" if plain else "torch-cells")
@@ -355,7 +356,6 @@ def measuring(plan: Plan, cells: list[CellFigures]) -> Iterator[tuple[str, Cell]
                     figures.check = disagreement(*worlds) or EQUAL
                     if sim.backend in ("torch", "torch-cells", "torch-fused", "cuda"):
                         figures.kernels_per_step = subject.kernels(figures.steps_per_call)
-                subjects.append(subject)
         for _ in range(plan.rounds):
             for subject in subjects:
                 figures = subject.figures
@@ -413,16 +413,19 @@ class _Subject:
             return lambda steps: self.sim.step(self.world, steps)
         return self.program.load({name: values.numpy().copy() for name, values in self.world.state.items()})
 
-    def kernels(self, steps: int) -> float:
+    def kernels(self, steps: int) -> float | None:
         """What torch's profiler sees of a step: a GPU's kernels and copies, or operators that call no others on the CPU."""
         os.environ.setdefault("KINETO_LOG_LEVEL", "99")  # otherwise it writes on stderr
         from torch.profiler import ProfilerActivity, profile
 
-        kind = ProfilerActivity.CPU if self.sim.device.type == "cpu" else ProfilerActivity.CUDA
+        kinds = {"cpu": ProfilerActivity.CPU, "cuda": ProfilerActivity.CUDA, "xpu": ProfilerActivity.XPU}
+        if (kind := kinds.get(self.sim.device.type)) is None:
+            return None
         with profile(activities=[kind]) as trace:
             self.sim.step(self.world, steps)
             now(self.sim.device)
-        events = [one for one in trace.events() if one.device_type.name == kind.name]
+        on_cpu = kind == ProfilerActivity.CPU
+        events = [one for one in trace.events() if (one.device_type.name == "CPU") == on_cpu]
         return sum(not (one.cpu_children or one.is_user_annotation) for one in events) / steps
 
     def profile(self) -> None:

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import time
+from contextlib import nullcontext
+from types import SimpleNamespace
+from unittest.mock import Mock
 
 import pytest
 
 import powderdsl
-from powderdsl.experiments.bench import Plan, Program, measuring, number, start_worlds
+from powderdsl.experiments.bench import Plan, Program, _Subject, measuring, number, start_worlds
 from powderdsl.targets.cpp.build import Building, building
 
 TINY = {"sizes": [(6, 8)], "batches": [1, 3], "rounds": 2, "seconds": 1e-3, "steps": 2}
@@ -104,6 +107,26 @@ def test_a_backend_that_fails_in_a_round_does_not_end_the_others(torch, monkeypa
         ("ZeroDivisionError", 1),
         ("equal", 2),
     ]
+
+
+def test_kernels_and_copies_of_a_gpu_are_counted(torch, monkeypatch):
+    """Without a GPU: the profiler's events are made up. Calls of its driver, and regions with names, do not count."""
+    launch, kernel, copy, region = (
+        SimpleNamespace(device_type=SimpleNamespace(name=kind), cpu_children=[], is_user_annotation=named)
+        for kind, named in [("CPU", False), ("CUDA", False), ("CUDA", False), ("CUDA", True)]
+    )
+    trace, asked = Mock(events=lambda: [launch, kernel, launch, copy, region]), []
+    monkeypatch.setattr(
+        "torch.profiler.profile", lambda activities: asked.extend(activities) or nullcontext(trace)
+    )
+    monkeypatch.setattr("powderdsl.experiments.bench.now", lambda device: 0.0)
+    subject = _Subject(Mock(), Mock(), None, Mock())
+    subject.sim.device.type = "cuda"
+    assert subject.kernels(4) == 2 / 4
+    assert [activity.name for activity in asked] == ["CUDA"]
+    assert subject.sim.step.call_args.args == (subject.world, 4)
+    subject.sim.device.type = "mps"
+    assert subject.kernels(4) is None
 
 
 def test_torch_has_its_threads_back(rules, torch):
