@@ -268,7 +268,6 @@ class Requirements:
 
 
 def find_requirements(ruleset: Ruleset, facts: Facts) -> dict[RuleLine, Requirements]:
-    """The requirements of each line that may happen."""
     named_ids = named_by_fields(ruleset)
     by_line: dict[RuleLine, Requirements] = {}
     for pass_ in ruleset.passes:
@@ -363,7 +362,6 @@ class ReducedWorld:
         return bool(facts.ids) and satisfiable(facts, [(c, HERE) for c in conditions], self.search.lets)
 
     def may(self, rule: Rule) -> bool:
-        """True if the rule may happen in this world."""
         return self._is_possible(self.rewrite(rule.mask))
 
     def may_make(self, rule: Rule) -> bool:

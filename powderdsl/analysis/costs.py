@@ -64,7 +64,6 @@ def costs(program: Program) -> tuple[PassCost, ...]:
 
 
 def _work(form: PassForm) -> Counter[str]:
-    """The amount of each kind of work."""
     count: Counter[str] = Counter()
     bits: Counter[str] = Counter()
     """Random bits a cell: for each stream those that its finest comparison needs. A pass shares them."""

@@ -116,7 +116,6 @@ def option(name: str, kind: Any, about: str, default: Any = None, *, to: str = "
 
 
 def path(name: str, metavar: str, about: str, **more: Any) -> Option:
-    """An option for a file or folder."""
     return option(name, click.Path(path_type=Path), about, metavar=metavar, **more)
 
 
@@ -149,7 +148,6 @@ def pairs(name: str, metavar: str, about: str, to: str, value: str = ".+", read:
 
 
 def knobs(about: str) -> Option:
-    """An option for the knobs of a task: values by name."""
     return pairs("--knob", "NAME=N", about, "knobs", "-?[0-9]{1,6}", int)
 
 

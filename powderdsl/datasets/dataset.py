@@ -73,7 +73,6 @@ def row_shape(recipe: Recipe, name: str) -> tuple[int, ...]:
 
 
 def shapes(recipe: Recipe, number: int, transitions: int) -> dict[str, tuple[int, ...]]:
-    """The shapes of a shard's arrays."""
     episodes = len(recipe.episodes_of(number))
     rows = {"observation": transitions + episodes, "length": episodes, "world": episodes}
     return {name: (rows.get(name, transitions), *row_shape(recipe, name)) for name in DTYPES}

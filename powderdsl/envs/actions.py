@@ -128,7 +128,6 @@ def action_form(kind: str, agent: Agent, device: torch.device) -> ActionForm:
 
 
 def _discrete(agent: Agent) -> tuple[Tensor, Tensor]:
-    """The table and the weights of the discrete form."""
     rows, columns = agent.bins
     places = rows * columns
     motions = [(vx, vy) for vy in range(3) for vx in range(3)]

@@ -208,7 +208,6 @@ class PowderEnv(Face, gymnasium.Env[Array, Any], EzPickle):
         return array(observed[0]), float(reward[0]), bool(terminated[0]), bool(truncated[0]), self._info(info)
 
     def _info(self, info: Info) -> dict[str, Any]:
-        """Return the infos of the single world."""
         assert self.tensors.episodes is not None
         infos = {
             "success": bool(info["success"][0]),

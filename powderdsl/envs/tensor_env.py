@@ -269,7 +269,6 @@ class TensorEnv:
         return torch.where(is_new, new, old), is_new
 
     def _new_params(self, changes: Any, mask: Tensor) -> dict[str, Tensor]:
-        """The parameters after a reset of `mask`."""
         if changes is None:
             return self.params
         whole = self.simulator.parameters(check_mapping("params", changes), self.num_envs)

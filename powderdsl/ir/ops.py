@@ -89,7 +89,6 @@ class Op:
     gates: int = 0
 
     def type_of(self, attr: Any, args: Sequence[Node]) -> Type:
-        """The type of the result."""
         kind = args[-1].type.name if self.result == "=" else self.result
         if kind != "int":
             return FLAG if kind == "flag" else REAL
@@ -220,7 +219,6 @@ class Graph:
 
     @property
     def size(self) -> int:
-        """The number of nodes."""
         return len(self._nodes)
 
     def node(self, op: str, type: Type, args: tuple[Node, ...] = (), attr: Hashable = None) -> Node:

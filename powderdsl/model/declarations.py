@@ -54,7 +54,6 @@ class Definition(Entry):
 
     @property
     def span(self) -> Span:
-        """The span of the name in the file."""
         return self.name.span
 
 

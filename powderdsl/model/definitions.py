@@ -115,7 +115,6 @@ def define_symbols(typer: Typer) -> list[tuple[str, int, Span]]:
 
 
 def _shaped_kernel(name: str, decl: KernelDecl, shape: Syntax, typer: Typer) -> Operand:
-    """A kernel that is declared by a shape and its radius."""
     try:
         kernel = typer.evaluate(shape, Scope(decl.pack, {}))
         if not isinstance(kernel, Kernel):

@@ -213,7 +213,6 @@ class Reader:
         return self.record(kind, node, f"the {noun} `{name.text}`" if noun else f"`{name.text}`", name=name)
 
     def entries(self, kind: type[E], node: Node | None) -> Iterator[E]:
-        """The records of a section's entries."""
         pairs = self.named(node, kind.NOUN) if kind.NOUN else self.pairs(node, "a mapping")
         return (record for name, value in pairs if (record := self.entry(kind, name, value)) is not None)
 
@@ -345,7 +344,6 @@ class Reader:
     # Values
 
     def shape(self, node: Node, wanted: str, help_text: str = "") -> None:
-        """Report a node of the wrong shape."""
         description = {Scalar: "a single value", Sequence: "a list", Mapping: "a mapping"}[type(node)]
         helps = [help_text] if help_text else []
         self.reporter.error(

@@ -127,7 +127,6 @@ def fits(ruleset: Ruleset, size: tuple[int, ...]) -> bool:
 
 
 def size_problem(ruleset: Ruleset, size: tuple[int, ...]) -> str:
-    """The message for a size that does not fit."""
     sides = f"rows and columns must be a multiple of {ruleset.side_multiple} each"
     return f"a world of {size[-2]}×{size[-1]} cells: with {ruleset.name}, {sides}"
 

@@ -310,7 +310,6 @@ class Moment:
 
     @cached_property
     def values(self) -> dict[str, Expr]:
-        """The values of its lets by name."""
         return {let.name: let.value for let in self.lets}
 
 

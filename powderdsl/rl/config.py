@@ -211,7 +211,6 @@ def chosen_policies(policies: Sequence[str] | None, task: Task, *, trained: bool
 
 
 def _contradictions(config: TrainConfig) -> Iterator[str]:
-    """Settings that exclude each other."""
     if config.init_from and config.init_expert:
         yield "`init_from` and `init_expert` are both given: the network learns from one of them"
     if config.init_from or config.init_expert:

@@ -206,7 +206,6 @@ class _Learner:
         return state
 
     def restore(self, state: Mapping[str, Any]) -> None:
-        """Continue from a `state`."""
         model = self.model
         model.policy.load_state_dict(state["policy"])
         model.policy.optimizer.load_state_dict(state["optimizer"])

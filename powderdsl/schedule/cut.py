@@ -290,7 +290,6 @@ class _Cutter:
         self.stored |= vars
 
     def computed(self, outs: Iterable[Out]) -> tuple[Out, ...]:
-        """Variables with the values that a loop computes."""
         return tuple([Out(out.var, self.value(self.split_masks.get(out.value, out.value))) for out in outs])
 
     def shared_parts(self, mask: Node) -> list[Node]:
@@ -335,7 +334,6 @@ class _Cutter:
         return movements
 
     def move(self, movements: dict[Node, Var], place: str) -> None:
-        """Planes that move together."""
         if movements:
             first, outs = next(iter(movements)), []
             for node, var in movements.items():

@@ -170,7 +170,6 @@ def match_slot_choices(value: Node, names: Container[str]) -> tuple[Node, list[N
 
 
 def is_comparison(node: Node) -> bool:
-    """True if a flag compares floats."""
     return node.op in COMPARISONS and node.args[0].type == REAL
 
 

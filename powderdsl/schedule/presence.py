@@ -95,7 +95,6 @@ def _times(schedule: Schedule, bits: dict[str, int]) -> dict[str, Time]:
 
 
 def _values_of(body: Iterable[Statement]) -> dict[str, Node]:
-    """The values of variables that loops compute."""
     loops = [loop for loop in body if isinstance(loop, Compute)]
     return {out.var.name: out.value for loop in loops for out in loop.outs}
 

@@ -68,7 +68,6 @@ class Rows:
 
     @property
     def outs(self) -> list[Out]:
-        """The variables that all loops compute."""
         return [out for part in self.loops for out in part.loop.outs]
 
 

@@ -166,7 +166,6 @@ class _Lowering:
         return load(self.graph, self.inputs[slot])
 
     def compute(self, nodes: Iterable[Node], place: str = "") -> None:
-        """Store nodes in variables."""
         missing = filter(self.missing, dict.fromkeys(nodes))
         if outs := tuple([Out(self.namer.var(node.type, node), self.value(node)) for node in missing]):
             self.body.append(Compute(outs, place))

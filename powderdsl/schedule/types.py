@@ -77,7 +77,6 @@ class Statement:
 
     @cached_property
     def vars(self) -> dict[str, Var]:
-        """The variables that it defines, by name."""
         return {out.var.name: out.var for loop in self.loops for out in loop.outs}
 
     @cached_property
@@ -92,7 +91,6 @@ class Statement:
 
     @property
     def results(self) -> list[Node]:
-        """The values of its variables."""
         return [out.value for out in self.outs]
 
     @cached_property
@@ -261,7 +259,6 @@ def load(graph: Graph, var: Var) -> Node:
 
 
 def is_zero(value: Node) -> bool:
-    """True if a value is the constant 0."""
     return value.op == "const" and not value.attr
 
 
@@ -419,7 +416,6 @@ def reads_of(values: Iterable[Node]) -> Iterator[Read]:
 
 
 def field_reads(loop: Compute) -> Iterator[Read]:
-    """The fields that a loop or its region reads."""
     return (read for read in reads_of(loop.values) if read.type == REAL)
 
 

@@ -208,7 +208,6 @@ def with_zeros(value: Node, planes: set[str], graph: Graph) -> Node:
 
 
 def movement_loop(move: Move, graph: Graph) -> Compute:
-    """A movement as a loop over words."""
     dy, dx = move.offset
     outs = []
     for out in move.outs:

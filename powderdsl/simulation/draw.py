@@ -42,7 +42,6 @@ class Ramp:
 
 
 def ramps(elements: Sequence[Element]) -> tuple[Ramp, ...]:
-    """The ramps of the elements that have a ramp, by id."""
     return tuple(
         Ramp(element.id, element.ramp.field, *_steps(element.ramp))
         for element in sorted(elements, key=lambda element: element.id)
@@ -61,7 +60,6 @@ class CellTint:
 
 
 def tints(fields: Sequence[Field]) -> tuple[CellTint, ...]:
-    """The tints of the fields that have one, in their order."""
     tints = []
     for field in fields:
         if (tint := field.tint) is not None:

@@ -152,7 +152,6 @@ class ByWidth:
         return tuple(getattr(self._latest, "notes", ()))
 
     def run(self, job: Job) -> Mapping[str, Array]:
-        """The state `job.steps` later."""
         self._latest = program = self._of(known_width(shape_of(job.state)[-1]))
         return program.run(job)
 
@@ -213,7 +212,6 @@ class AutoProgram:
         return (f"{self._name}: native is compiled from {WORTH:g} s of work, or by --backend native",)
 
     def run(self, job: Job) -> Mapping[str, Array]:
-        """The state `job.steps` later."""
         if job.timing is not None:
             return (self._native or self._first()).run(job)
         cells = prod(shape_of(job.state))

@@ -173,7 +173,6 @@ class Observer:
 
     @cached_property
     def _looks(self) -> dict[str, Any]:
-        """`draw.looks` of the ruleset, as tensors."""
         shown, on_device = looks(self.ruleset.elements, self.ruleset.fields), Tensors(self.device).from_numpy
         ramps = [
             replace(ramp, starts=on_device(ramp.starts), colors=on_device(ramp.colors))

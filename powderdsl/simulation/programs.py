@@ -183,7 +183,6 @@ class BackendProgram(NamedTuple):
     """Returns the program for chosen passes and given draws, if `whole` cannot run them."""
 
     def run(self, job: Job) -> Mapping[str, Array]:
-        """The state `job.steps` later."""
         if self.rest is None or (job.passes is None and not job.draws):
             return self.whole.run(job)
         return self.rest().run(job)

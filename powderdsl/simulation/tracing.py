@@ -130,7 +130,6 @@ class Attempt:
 
     @property
     def happened(self) -> bool:
-        """True if the rule happened there."""
         return bool(self.substep.masks[id(self.rule.rule)][(0, *self.cell)])
 
     @cached_property
@@ -145,7 +144,6 @@ class Attempt:
 
     @property
     def held(self) -> tuple[Part, ...]:
-        """The parts that hold."""
         return tuple(part for part in self.parts if part.holds)
 
     @property
@@ -164,7 +162,6 @@ class Change:
 
     @property
     def changed(self) -> bool:
-        """True if the values differ."""
         return not np.array_equal(self.before, self.after)
 
 

@@ -208,5 +208,4 @@ def literal(value: float) -> str:
 
 
 def braced(items: Iterable[object]) -> str:
-    """A list in C++."""
     return f"{{{', '.join(map(str, items))}}}"

@@ -67,7 +67,6 @@ class Values(Generic[Named]):
         return node.args[:1] if node.op == "when" else node.args
 
     def fresh(self, prefix: str) -> str:
-        """A new name."""
         self.count += 1
         return f"{prefix}{self.count}"
 

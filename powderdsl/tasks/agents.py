@@ -73,7 +73,6 @@ class MoveDecl(Record, noun="a move"):
 
 
 def read_agent(reader: Reader, decl: AgentDecl, rules: Ruleset, size: Size) -> Agent:
-    """The agent that a task declares."""
     choices, place = _choices(reader, decl.may, rules), decl.name.span
     blows = BLOW in choices
     if blows and decl.speed is None:

@@ -257,7 +257,6 @@ def _reporting_user_errors(name: str, what: str) -> Iterator[None]:
 
 
 def encoder_of(config: TrainConfig, slots: int) -> ActionChannels:
-    """Return the encoder that turns inputs into channels."""
     if config.recorded is None:
         return ActionChannels(slots)
     return ActionChannels(slots, len(config.recorded.channels), config.recorded.actions)

@@ -41,7 +41,6 @@ class Checked:
     ledger: Ledger | None = None
 
     def number(self, severity: Severity) -> int:
-        """Count the diagnostics of this severity."""
         return sum(diagnostic.severity is severity for diagnostic in self.diagnostics)
 
 

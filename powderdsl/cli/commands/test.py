@@ -133,7 +133,6 @@ class _Report:
             click.echo("".join(f"{line}\n" for line in lines), nl=False)
 
     def test(self, name: str, ruleset: Ruleset) -> None:
-        """Tests, invariants, coverage of one ruleset."""
         start = monotonic()
         runner = Runner(ruleset, self.backend)
         tests = run_examples(ruleset, sim=runner.sim, seen=lambda world: runner.note(world.state))

@@ -314,7 +314,6 @@ def rules_of(rules: str, task: str, packs: tuple[str, ...], held_out: tuple[str,
 
 
 def _run(config: TrainConfig, folder: Path, values: dict[str, Any], **more: Any) -> None:
-    """Train, and show the progress."""
     from powderdsl.worldmodel.training import train
 
     machine, network = _machine(values), _import_network(values["network_name"])

@@ -524,7 +524,6 @@ def call(typer: Typer, syntax: Syntax, scope: Scope) -> Operand:
 
 
 def _apply(typer: Typer, function: Operation, operands: list[tuple[Operand, Span]], span: Span) -> Operand:
-    """An operation on arguments of the kinds that it takes."""
     if NUMBER in function.takes:
         values = [(typer.value(*operand), operand[1]) for operand in operands]
         while len(values) > len(function.parameters):

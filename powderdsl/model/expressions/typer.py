@@ -156,7 +156,6 @@ class Typer:
         return HANDLERS[syntax.kind](self, syntax, scope)
 
     def operands(self, syntax: Syntax, scope: Scope) -> list[Operand]:
-        """The operands of its parts."""
         return [self.evaluate(child, scope) for child in syntax.children]
 
     def spend(self, parts: int, span: Span) -> None:
@@ -341,7 +340,6 @@ class Typer:
         raise self.wrong(number(value), _KINDS[kind.name], span, *_HELPS.get(kind.name, ()))
 
     def offset(self, offset: Offset, span: Span) -> Offset:
-        """An offset that rules can reach."""
         if max(abs(offset[0]), abs(offset[1])) > MAX_OFFSET:
             label = f"rules reach {MAX_OFFSET} cells a step"
             raise self.fail("PD409", "the neighbor is too far away", span, label)

@@ -105,7 +105,6 @@ def _report_decided(passes: tuple[Pass, ...], silent: Sequence[Span], reporter: 
 
 
 def _parts(rules: Iterable[Rule]) -> Iterator[Expr]:
-    """The expressions of some rules."""
     for rule in rules:
         yield rule.mask
         if isinstance(rule, Transform):

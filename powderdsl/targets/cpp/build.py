@@ -177,7 +177,6 @@ def building(how: Building) -> Iterator[None]:
 
 
 def current() -> Building:
-    """The settings in effect."""
     return _building.get()
 
 

@@ -172,7 +172,6 @@ class _Loop(CellValues[str]):
         return on_all("const Plane* const", masks, call)
 
     def after(self) -> str:
-        """Statements after the loop."""
         ends = [f"{out.var.name}->still = !some{out.var.name};" for out in self.lasting]
         return " ".join([*ends, *(f"close_plane(c, {name});" for name in self.flags)])
 
@@ -223,7 +222,6 @@ class _Loop(CellValues[str]):
     # Rows, chunk by chunk
 
     def cell_row(self) -> Iterator[str]:
-        """A row of a loop over cells."""
         texts = [(out, self.of(out.value)) for out in self.outs]
         stores, counts, lives = [], [], []
         for out, value in texts:
@@ -268,7 +266,6 @@ class _Loop(CellValues[str]):
         return [f"const float* {name} = {call};" for call, name in self.pointers.items()]
 
     def is_row_live(self, live: Node) -> str:
-        """A test that a field is nonzero in a row."""
         name, dy = str(live.args[0].attr), live.attr[0]
         if name in self.rows.rings:
             return f"{self.at(name, dy)} != nothing"
@@ -333,7 +330,6 @@ class _Loop(CellValues[str]):
         return name in self.rows.rings and self.rows.rings[name].bare is not None
 
     def row(self, field: str, dy: int, *, wraps: bool = True) -> str:
-        """The pointer to a field's row."""
         self.layout.cover(real_rows=abs(dy))
         field = self.rows.places.get(field, field)
         if field in self.rows.rings:

@@ -190,6 +190,5 @@ class NativeProgram:
         return PackedState(self, handle, like_of(state))
 
     def parts(self, name: str, value: Tensor) -> Iterator[tuple[Tensor, int, int, bool]]:
-        """The parts of a state tensor, each with its home."""
         for piece in self.pieces[name]:
             yield piece.of(value), *self.homes[piece.slot]

@@ -69,7 +69,6 @@ KINDS = {"real": "Field", "flag": "Plane"}
 
 
 def answer(node: Node) -> str:
-    """A condition in C++."""
     match node.op:
         case "any" | "some":
             return " || ".join(map("!{0.attr}->zero".format, node.args)) or "false"
@@ -232,7 +231,6 @@ class _Words(WordText):
         return " ".join(map("{}, {});".format, self.edges, self.edges.values()))
 
     def plane(self, name: str) -> str:
-        """The pointer to a plane's words."""
         return self.pointer(f"{self.places.get(name, name)}->data")
 
     def pointer(self, words: str) -> str:

@@ -244,7 +244,6 @@ class CudaProgram:
         return after
 
     def _pack(self, state: Mapping[str, Tensor]) -> DeviceState:
-        """State slots as packed planes and reals."""
         (batch, height, width), device = shape_of(state), state["element"].device
         layout = self.kernel(height, width)[0].layout
         row_words = -(-width // 32)
@@ -265,7 +264,6 @@ class CudaProgram:
         return DeviceState(self, planes, reals, like_of(state))
 
     def unpack(self, state: DeviceState, name: str) -> Tensor:
-        """One slot of a state in its storage dtype."""
         dtype, (*_, height, width) = state.like[name]
         parts, layout = self._pieces[name], self.kernel(height, width)[0].layout
         if parts[0].is_real:

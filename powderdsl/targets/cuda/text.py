@@ -243,7 +243,6 @@ class _Cells(CellValues[str]):
         return self.known[axis, by]
 
     def mask(self, node: Node) -> str:
-        """The word of a flag."""
         if node.op == "param":
             return f"PARAM_FLAG({self.layout.param_planes[param_key(node)]})"
         return self.masks.setdefault(self.printer.numbers[node.attr], f"m{len(self.masks)}")

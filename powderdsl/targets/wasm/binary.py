@@ -275,7 +275,6 @@ def const(type: str, number: float) -> Value:
 
 
 def vector(octets: bytes) -> Value:
-    """A vector of 16 bytes."""
     return Value("v128", OPCODES["v128.const"] + octets)
 
 
@@ -514,7 +513,6 @@ class Module:
 
     @property
     def code(self) -> bytes:
-        """The module in the binary format."""
         variables = [
             bytes([TYPES[type], 1]) + const(type, start).code + OPCODES["end"]
             for type, start in self._globals

@@ -120,7 +120,6 @@ class CellLoop(Loop):
         return (plane + at)[self.memory.half]
 
     def row_flags(self, planes: Iterable[str]) -> Value:
-        """A test that planes hold a flag in this row of the lane."""
         addresses = [self.addresses[name] for name in planes]
         return op("i64.ne", self.library.row_flags(addresses, self.row, self.memory.half), 0)
 
@@ -143,7 +142,6 @@ class CellLoop(Loop):
             body.jump(self.skip)
 
     def copy(self, place: int, source: Value) -> None:
-        """Copy a line from another field."""
         self.set_live(place, self.live(source))
         with body.when(self.live(source)):
             self.copy_cells(

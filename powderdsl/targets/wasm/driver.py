@@ -411,7 +411,6 @@ class Driver(Batches):
                 body.do(look())
 
     def _constant_field(self, value: F32) -> Value:
-        """A new field of equal values."""
         library = self.library
         field = body.let(library.take_field())
         field[SOME] = 1

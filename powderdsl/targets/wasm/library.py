@@ -159,7 +159,6 @@ class Memory:
         return start + number * size
 
     def slot(self, name: str, type: object) -> Member:
-        """The plane or field of a slot in a group."""
         layout = self.layout
         return self.slots[len(layout.planes) + layout.reals[name] if type == REAL else layout.planes[name]][0]
 

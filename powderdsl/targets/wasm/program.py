@@ -134,7 +134,6 @@ class Instance:
         return free.pop() if free else self.call("allocate", worlds, rows, self.width)
 
     def copy(self, state: WasmState) -> int:
-        """A batch with a copy of a state of this instance."""
         worlds, rows, _ = shape_of(state)
         batch = self.new(worlds, rows)
         self.call("copy", state.handle, batch)

@@ -303,7 +303,6 @@ def _of_number(number: Value, items: Iterable[Item]) -> Iterator[Item]:
 
 
 def _fresh_value(piece: Piece, element: Value, table: int) -> Value:
-    """The value that fresh cells of an element have."""
     return load("f32.load" if piece.is_real else "i32.load", element << 2, table)
 
 

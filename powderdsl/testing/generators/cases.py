@@ -33,7 +33,6 @@ class Choices:
         return options[self.below(len(options))]
 
     def integer(self, lo: int, hi: int) -> int:
-        """An integer of lo..hi."""
         return lo + self.below(hi - lo + 1)
 
     def maybe(self, percent: int) -> bool:

@@ -131,7 +131,6 @@ class Original:
 
 
 def warnings_of(diagnostics: tuple[Diagnostic, ...]) -> Counter[str]:
-    """Count the warnings of each code."""
     return Counter(diagnostic.code for diagnostic in diagnostics if diagnostic.severity is Severity.WARNING)
 
 

@@ -44,12 +44,10 @@ class Mutant:
 
     @property
     def operator(self) -> str:
-        """The kind of the mistake."""
         return self.change.operator
 
     @property
     def text(self) -> str:
-        """The whole file with the mistake."""
         text = self.source.text
         return text[: self.change.start] + self.change.text + text[self.change.end :]
 
@@ -184,7 +182,6 @@ class Names:
         return [*dict.fromkeys([*ring[:1], *ring[-1:]])]
 
     def with_lets(self, lets: dict[str, str]) -> Names:
-        """The same names with the `let` values of a pass."""
         kinds = {**self.kinds, **dict.fromkeys(lets, "let")}
         return replace(self, kinds=kinds, own=self.own | frozenset(lets), local=lets)
 
@@ -473,7 +470,6 @@ class Entry:
         return {key.text: (key, node) for key, node in container.entries}
 
     def entries(self) -> Iterator[Entry]:
-        """The entries below a node."""
         return entries_of(self.node, self.path, self.names)
 
     def items(self) -> list[Entry]:
@@ -553,7 +549,6 @@ def option(operator: str, *words: str) -> EntryMistake:
 
 
 def _bounds(entry: Entry) -> Changes:
-    """Other bounds of a declared kind."""
     if isinstance(entry.node, Scalar):
         yield from numbers("field", entry.node.content, r"(?<!\d\.)(?<!\w)\d+(?!\d|\.\d)", near_bounds)
 

@@ -52,7 +52,6 @@ class Property:
 
     @classmethod
     def of(cls, invariant: Invariant) -> Property:
-        """The property that a declared invariant claims."""
         text = one_line(invariant.span)
         return cls(invariant.claim, text, invariant.pack, invariant.span, invariant.without, invariant.scope)
 

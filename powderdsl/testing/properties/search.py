@@ -290,7 +290,6 @@ class QuickSearch(InvariantSearch):
     work: ClassVar[int] = 200_000_000  # for all the worlds that were found: some seconds
 
     def try_random(self) -> None:
-        """Run a few worlds."""
         for number, sample in enumerate(random_samples(self.runner.ruleset, QUICK_SEED, QUICK_WORLDS)):
             if not self.undecided:
                 return

@@ -162,7 +162,6 @@ def _read_statements(node: yaml_tree.Node, reader: Reader) -> tuple[Paint | Sett
 
 
 def not_a_statement(item: yaml_tree.Mapping, reporter: Reporter, fix: str) -> None:
-    """Report a mapping in place of a statement."""
     message, label = "YAML reads this statement as a mapping", "a `:` at the end of a word makes it a key"
     reporter.error("PD605", message, first_line(item), label, helps=[fix])
 
