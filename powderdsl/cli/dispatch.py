@@ -76,9 +76,8 @@ class GuardedCommand(click.Command):
         for stream in (sys.stdout, sys.stderr):
             if hasattr(stream, "reconfigure"):
                 stream.reconfigure(errors="replace")
-        gc.set_threshold(
-            100_000
-        )  # what commands make stays alive: searching it for cycles took a tenth of their time
+        # What commands make stays alive: searching it for cycles took a tenth of their time.
+        gc.set_threshold(100_000)
         options["standalone_mode"] = False
         warnings.formatwarning = plain_warning
         if os.environ.pop(LIFELINE, None):

@@ -58,8 +58,7 @@ class MatrixPatches(nn.Module):
         self.register_buffer("columns", columns)
 
     def forward(self, observed: Tensor) -> Tensor:
-        means: Tensor = self.get_buffer("rows") @ observed @ self.get_buffer("columns")
-        return means
+        return self.get_buffer("rows") @ observed @ self.get_buffer("columns")
 
 
 class Patches(MatrixPatches):
@@ -133,8 +132,7 @@ class Features(BaseFeaturesExtractor):
 
     def forward(self, observed: Tensor) -> Tensor:
         """Features float32 [B, features_dim]."""
-        features: Tensor = self.layers(observed)
-        return features
+        return self.layers(observed)
 
 
 def patches_of(env: TensorEnv, patches: tuple[int, int], frames: int = 1) -> Any:

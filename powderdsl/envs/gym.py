@@ -35,8 +35,7 @@ RENDER_MODES = ("rgb_array", "ansi")
 
 def array(tensor: Tensor) -> Array:
     """A tensor as an array; from a device it is copied."""
-    values: Array = tensor.cpu().numpy()
-    return values
+    return tensor.cpu().numpy()
 
 
 def arrays(info: Info) -> dict[str, Any]:

@@ -428,8 +428,7 @@ def _compare(gates: Gates, node: Node, a: Bits, b: Bits) -> Node:
             continue
 
         def test(number: int, side: Node = side, limit: int = other.attr) -> bool:
-            result: bool = holds(number, limit) if side is left else holds(limit, number)
-            return result
+            return holds(number, limit) if side is left else holds(limit, number)
 
         if side.op == "count" and side.type.lo >= 0:  # none or some: neighbors are joined, not counted
             some = {test(number) for number in range(1, side.type.hi + 1)}

@@ -24,8 +24,7 @@ def all_ones(value: float) -> bool:
 def stepped(value: float, by: int) -> float:
     """The float32 that is `by` steps away from a finite float32 of at least 0."""
     (bits,) = struct.unpack("<I", struct.pack("<f", abs(value)))
-    result: float = struct.unpack("<f", struct.pack("<I", bits + by))[0]
-    return result
+    return struct.unpack("<f", struct.pack("<I", bits + by))[0]
 
 
 def square_root(value: float) -> float:

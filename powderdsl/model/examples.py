@@ -157,9 +157,8 @@ class _ExampleReader:
             raise typer.fail("PD109", f"the test `{name}` checks nothing", place, label)
         height, width = len(given), len(given[0])
         reach = ((dy, dx, 1) for dy in range(1 - height, height) for dx in range(1 - width, width))
-        scope = Scope(
-            self.pack, {"world": Kernel("world", tuple(reach), wrap=False)}
-        )  # sees all cells from each
+        # A kernel that sees all cells from each.
+        scope = Scope(self.pack, {"world": Kernel("world", tuple(reach), wrap=False)})
         always = tuple(typer.condition(syntax, scope) for syntax in decl.always)
         often = []
         for change, chance in decl.often:
@@ -204,9 +203,8 @@ class _ExampleReader:
             element = composition.element(value.word, self.pack)
             if element is None:
                 if value.is_optional:
-                    raise Unresolved(
-                        value.word
-                    )  # a test of what packs do together waits until both are loaded
+                    # A test of what packs do together waits until both are loaded.
+                    raise Unresolved(value.word)
                 report_unknown("element", value, composition.elements, self.typer.reporter)
                 raise Poisoned
             if len(key.text) != 1:

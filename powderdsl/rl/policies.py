@@ -79,8 +79,7 @@ class BinDistribution:
         return self.form.decode(values).to(values.device)
 
     def log_prob(self, actions: Tensor) -> Tensor:
-        log_prob: Tensor = self.distribution.log_prob(self.form.encode(actions.long()).to(actions.device))
-        return log_prob
+        return self.distribution.log_prob(self.form.encode(actions.long()).to(actions.device))
 
     def mode(self) -> Tensor:
         return self.action(self.distribution.probs.argmax(1))
@@ -159,8 +158,7 @@ class BinPolicy(ActorCriticPolicy):
         return BinDistribution(self.form, Categorical(logits=scores))
 
     def _value(self, seen: Tensor) -> Tensor:
-        value: Tensor = self.judge(seen)
-        return value
+        return self.judge(seen)
 
     def forward(self, observed: Any, deterministic: bool = False) -> tuple[Tensor, Tensor, Tensor]:
         seen = self._seen(observed)
@@ -226,8 +224,7 @@ class TrainedPolicy:
                 (drawn[:, column, None] * bounds[:, -1:] >= bounds).sum(1)
                 for column, bounds in enumerate(below)
             ]
-        actions: Tensor = distribution.action(indices[0]) if joint else torch.stack(indices, 1)
-        return actions
+        return distribution.action(indices[0]) if joint else torch.stack(indices, 1)
 
 
 class _NoOptimizer:

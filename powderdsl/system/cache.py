@@ -83,8 +83,7 @@ def persistent(name: str, inputs: str, make: Callable[[], T]) -> T:
         path = find(compiled_folder(), key)
         if path is not None:
             # Whoever can write into the folder can also replace libraries, so a pickle is as safe as they are.
-            stored: T = pickle.loads(read_bytes(path, LIMIT))
-            return stored
+            return pickle.loads(read_bytes(path, LIMIT))
     start = time.process_time()
     result = make()
     if time.process_time() - start > QUICK:

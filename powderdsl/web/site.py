@@ -154,9 +154,7 @@ def shipped_files() -> dict[str, Make]:
 
 
 def _shipped_rows() -> list[dict[str, Any]]:
-    rows: list[dict[str, Any]]
-    rows = json.loads(cached("shipped.json", lambda: _dump([_row(entry) for entry in shipped_entries()])))
-    return rows
+    return json.loads(cached("shipped.json", lambda: _dump([_row(entry) for entry in shipped_entries()])))
 
 
 def _row(entry: Entry) -> dict[str, Any]:

@@ -84,8 +84,7 @@ class Encoded(nn.Module):
         self.encoder, self.network = encoder, network
 
     def forward(self, inputs: Tensor) -> Tensor:
-        logits: Tensor = self.network(self.encoder(inputs))
-        return logits
+        return self.network(self.encoder(inputs))
 
 
 # The paper's network

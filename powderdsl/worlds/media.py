@@ -123,10 +123,8 @@ def _encode(command: list[str], frames: Iterable[NDArray[np.uint8]]) -> None:
             with delay_signal():
                 encoder = subprocess.Popen(command, stdin=subprocess.PIPE, stderr=log, start_new_session=True)
             assert encoder.stdin is not None
-            with (
-                suppress(BrokenPipeError),
-                encoder.stdin as pipe,
-            ):  # if the encoder died, its log has the reason
+            # If the encoder died, its log has the reason.
+            with suppress(BrokenPipeError), encoder.stdin as pipe:
                 for frame in frames:
                     pipe.write(np.ascontiguousarray(frame).data)
             status = encoder.wait()
@@ -150,9 +148,8 @@ def _indexed(images: Any, frame: NDArray[np.uint8]) -> Any:
     columns = np.append(True, (cells[:, 1:] != cells[:, :-1]).any(axis=0).any(axis=1))
     packed = cells[:, columns].astype(np.uint32) @ np.array([1 << 16, 1 << 8, 1], dtype=np.uint32)
     colors, index = np.unique(packed, return_inverse=True)
-    if (
-        len(colors) > 256
-    ):  # which ones remain depends on shares of pixels: the same in one pixel of each square
+    if len(colors) > 256:
+        # Which ones remain depends on shares of pixels: the same in one pixel of each square.
         down, across = (gcd(len(starts), *np.flatnonzero(starts).tolist()) for starts in (rows, columns))
         image = images.fromarray(np.ascontiguousarray(frame[::down, ::across]))
         image = image.quantize(256, dither=images.Dither.NONE)

@@ -108,7 +108,9 @@ def train_command(folder: Path | None, ignore_actions: bool, **values: Any) -> N
         _run(config, folder or Path("runs") / (Path(config.data.task).stem or "run"), values)
         return
     _refuse_world_options(values)
-    recording = _open_recording(values["data"], values["task"])
+    from powderdsl.worldmodel.worlds import open_recording
+
+    recording = open_recording(values["data"], values["task"])
     recorded = replace(recording.recorded, actions=not ignore_actions)
     with user_values():
         config = replace(
@@ -270,16 +272,10 @@ def _refuse_world_options(values: Mapping[str, Any]) -> None:
             raise BadInput(f"{option.opts[0]} selects worlds, and --data has its own")
 
 
-def _open_recording(folder: Path, task: str | None) -> Recording:
-    """The recording in a dataset's folder."""
-    from powderdsl.worldmodel.worlds import open_recording
-
-    return open_recording(folder, task)
-
-
 def _load_network(run: str, values: dict[str, Any]) -> tuple[Trained, Recording | None, Machine]:
     """The network of a run, the recording that it is tested on if it has actions, and where to compute."""
     from powderdsl.worldmodel.training import load_trained
+    from powderdsl.worldmodel.worlds import open_recording
 
     machine, folder = _machine(values), values["data"]
     trained = load_trained(run, device=machine.device, network=_import_network(values["network_name"]))
@@ -292,7 +288,7 @@ def _load_network(run: str, values: dict[str, Any]) -> tuple[Trained, Recording 
     if folder is None and not isinstance(recorded, str):
         raise BadInput("--data: say which dataset")
     task = values["task"] or trained.config.data.task
-    return trained, _open_recording(folder or Path(str(recorded)), task), machine
+    return trained, open_recording(folder or Path(str(recorded)), task), machine
 
 
 def _import_network(name: str | None) -> CustomNetwork | None:

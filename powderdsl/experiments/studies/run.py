@@ -299,8 +299,7 @@ def run_on_ray(
             task = remote.options(**options).remote(study, folder, run.size, run.threads, point)
             tasks.append(task)
             try:
-                outcome: Outcome = ray.get(task)
-                return outcome
+                return ray.get(task)
             except Exception as error:  # Ray's messages end with the exception, after a traceback
                 last = (str(error).strip().splitlines() or [""])[-1][:400]
                 return Outcome(point, {}, f"{type(error).__name__}: {last}")
