@@ -36,8 +36,7 @@ def printable(text: str, *, lines: bool = False) -> str:
     That covers control characters (also C1, which some terminals obey), marks of direction, characters without a
     shape, and bytes that are not UTF-8. JSON stays the same JSON.
 
-    Args:
-        lines: keep line breaks and tabs, which one line of a message cannot have.
+    `lines`: keep line breaks and tabs, which one line of a message cannot have.
     """
     return _UNPRINTABLE.sub(
         lambda match: match[0] if lines and match[0] in "\t\n" else _escaped(match[0]), text

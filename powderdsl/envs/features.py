@@ -18,8 +18,7 @@ FEWEST, MOST = 8, 32
 class Expand(nn.Module):
     """The channels of ``matrix``, float32 [B, C, H, W], from observations ``ids`` or ``compact``.
 
-    Args:
-        sources: the channel of the observation that each comes from. tables: [C, 256], what it is by the number there.
+    `sources`: the channel of the observation that each comes from. `tables`: [C, 256], what it is by the number there.
     """
 
     def __init__(self, sources: tuple[int, ...], tables: Tensor):

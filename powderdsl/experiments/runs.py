@@ -262,12 +262,9 @@ def open_run(
 ) -> RunFolder:
     """Begin a run, or resume it with the same configuration.
 
-    Args:
-        config: what JSON can hold. note: more to keep in ``run.json``, which takes no part in the comparison.
-
-    Raises:
-        CompileError: PD621 where the folder holds another run, or other files; PD620 where its ``run.json`` is damaged;
-            PD613 where nothing can be written.
+    `config`: what JSON can hold. `note`: more to keep in ``run.json``, which takes no part in the comparison. Raises
+    CompileError: PD621 where the folder holds another run, or other files; PD620 where its ``run.json`` is damaged;
+    PD613 where nothing can be written.
     """
     folder, plain = Path(path), json.loads(json.dumps(config))
     if (folder / ABOUT).exists():

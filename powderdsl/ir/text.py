@@ -63,8 +63,7 @@ def attr_text(attr: object) -> str:
 def structure(pass_: PassGraph, *, places: bool = True) -> bytes:
     """A digest that is equal for two passes only if every stage gives equal results for both.
 
-    Args:
-        places: also compare the files and lines of rules, which messages and listings name.
+    `places`: also compare the files and lines of rules, which messages and listings name.
     """
     numbers: dict[Node, int] = {}
     rows: list[object] = []

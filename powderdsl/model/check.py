@@ -263,8 +263,7 @@ def check_invariants(
 ) -> tuple[Invariant, ...]:
     """The invariants of all packs and of the ruleset, except invariants that need a pack which is not loaded.
 
-    Args:
-        check_alone: checks the packs of the scope of an invariant that cannot hold.
+    `check_alone`: checks the packs of the scope of an invariant that cannot hold.
     """
     written: list[tuple[str, Syntax, RulesetDecl | None]]
     written = [(name, line, None) for name, pack in composition.packs.items() for line in pack.invariants]

@@ -197,8 +197,7 @@ def check_task(config: TrainConfig, task: Task) -> None:
 def chosen_policies(policies: Sequence[str] | None, task: Task, *, trained: bool) -> list[str]:
     """The policies to play, in the order of POLICIES. Raises ValueError.
 
-    Args:
-        policies: some of POLICIES; None: all, but not an expert that searches. trained: whether there is a trained one.
+    `policies`: some of POLICIES; None: all, but not an expert that searches. `trained`: whether there is a trained one.
     """
     there = {"trained": trained, "expert": task.expert is not None}
     known = [policy for policy in POLICIES if there.get(policy, True)]

@@ -241,13 +241,9 @@ def subject(
 def player(
     name: str, program: TaskProgram, run: RunFolder | None = None, *, deterministic: bool = False
 ) -> Policy | ExpertPlayer | None:
-    """The policy of a name among POLICIES; None does nothing.
+    """The policy of a name among POLICIES; None does nothing. Raises CompileError as `load_policy`.
 
-    Args:
-        run: whose policy the trained one is. deterministic: it takes the likeliest action.
-
-    Raises:
-        CompileError: as `load_policy`.
+    `run`: whose policy the trained one is. `deterministic`: it takes the likeliest action.
     """
     if name == "trained" and run is not None:
         env = TensorEnv(program, 1, observation=config_of(run).observation)

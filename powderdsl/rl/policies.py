@@ -40,11 +40,8 @@ DILATIONS = (1, 2, 4)
 def fcn_policy(env: TensorEnv, channels: int = 32, frames: int = 1) -> dict[str, Any]:
     """`policy_kwargs` of `BinPolicy` for the observations and actions of an environment.
 
-    Args:
-        channels: of each convolution. frames: how many observations are stacked.
-
-    Raises:
-        ValueError: for observations that are pictures.
+    `channels`: of each convolution. `frames`: how many observations are stacked. Raises ValueError for observations
+    that are pictures.
     """
     bins = env.task.agent.bins
     form = action_form("discrete", env.task.agent, torch.device("cpu"))

@@ -16,8 +16,7 @@ MAX_BYTES = 4 * MAX_CHARACTERS
 def read_source(path: Path, reporter: Reporter, *, limit: int = MAX_BYTES) -> Source | None:
     """The text of a UTF-8 file, or None after reporting PD101 or PD102. Its name is relative where it lies below here.
 
-    Args:
-        limit: bytes that it may have.
+    `limit`: bytes that it may have.
     """
     try:
         text = read_bytes(path, limit).decode("utf-8-sig")

@@ -9,13 +9,9 @@ from typing import Any
 
 
 def require(module: str, work: str, *helps: str) -> Any:
-    """Import a module.
+    """Import a module. Raises CompileError (PD612) if it cannot be imported.
 
-    Args:
-        work: the subject of a sentence that needs the module: ``reading a picture``. helps: fixes.
-
-    Raises:
-        CompileError: PD612 if it cannot be imported.
+    `work`: the subject of a sentence that needs the module: ``reading a picture``. `helps`: fixes.
     """
     try:
         return import_module(module)

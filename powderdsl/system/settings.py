@@ -93,8 +93,7 @@ def check_settings(config: Any) -> None:
 def read_record(kind: type[Record], data: Any, problems: list[str], path: str = "") -> Record | None:
     """The record that a file describes, or None after adding everything that is wrong to `problems`.
 
-    Args:
-        path: the place of `data` in its file, such as ``shards[3]``, with which problems name places.
+    `path`: the place of `data` in its file, such as ``shards[3]``, with which problems name places.
     """
     if not isinstance(data, Mapping):
         problems.append(f"`{path or 'file'}` must be a mapping, found {data!r:.80}")

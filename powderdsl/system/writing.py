@@ -31,9 +31,8 @@ def replacing(path: Path, *, follow: bool = False) -> Iterator[Path]:
     When the block fails or is interrupted, nothing is left and an older file stays as it was. Raises CompileError (PD613)
     if the file cannot be written, by the block itself too.
 
-    Args:
-        follow: for paths that the user named: a link stays a link, and the file that it leads to is replaced. Otherwise
-            the link itself is replaced, which may come from a stranger's folder.
+    `follow`: for paths that the user named: a link stays a link, and the file that it leads to is replaced. Otherwise
+    the link itself is replaced, which may come from a stranger's folder.
     """
     target = destination(path, follow=follow)
     temporary = target.parent / f".{target.stem[:40]}{MARK}{token_hex(8)}{target.suffix}"

@@ -155,12 +155,8 @@ def _baselines(fit: Iterable[Pairs], rules: Ruleset, slots: int) -> dict[str, Ne
 def unseen_worlds(trained: Trained, *, machine: Machine = HERE, **tested_on: Any) -> TaskWorlds:
     """Worlds to test a network on. Those that the rules cannot have are left out, as long as others remain.
 
-    Args:
-        tested_on: see `unseen_data`.
-
-    Raises:
-        CompileError: as `TaskWorlds`; PD623 if the rules have elements that the network has no slots for, or the network
-            learned from a dataset.
+    `tested_on`: see `unseen_data`. Raises CompileError: as `TaskWorlds`; PD623 if the rules have elements that the
+    network has no slots for, or the network learned from a dataset.
     """
     if trained.config.recorded is not None:
         raise misfit(trained.run.path, "it predicts recorded transitions, with actions")

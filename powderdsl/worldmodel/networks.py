@@ -276,11 +276,8 @@ def network_of(config: TrainConfig, slots: int, own: nn.Module | CustomNetwork |
 def fit_weights(model: nn.Module, checkpoint: Checkpoint, *, grow: bool = False) -> None:
     """Give a network the weights of a checkpoint, which may hold anything.
 
-    Args:
-        grow: the network may be larger: what the checkpoint lacks keeps the weights that it has.
-
-    Raises:
-        CompileError: PD623 if they are those of another network.
+    `grow`: the network may be larger: what the checkpoint lacks keeps the weights that it has. Raises CompileError
+    (PD623) if they are those of another network.
     """
     with reporting_misfits(checkpoint.path, "its weights are those of another network"):
         weights = dict(checkpoint.state["model"])

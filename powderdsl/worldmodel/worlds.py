@@ -248,11 +248,8 @@ def watch(
     and also among the elements of packs that the task does not know; of these among the elements of the packs `only`,
     if any of them has elements. An element that is named alone must be there.
 
-    Args:
-        partly: leave out variants that the rules cannot have, as long as one remains.
-
-    Raises:
-        CompileError: PD604 if worlds need elements that the rules do not have.
+    `partly`: leave out variants that the rules cannot have, as long as one remains. Raises CompileError (PD604) if
+    worlds need elements that the rules do not have.
     """
     original = task.split(split)
     variants, missing = [], []
@@ -445,12 +442,9 @@ class Recording:
 def open_recording(folder: str | Path, task: str | None = None) -> Recording:
     """The recording in a dataset's folder.
 
-    Args:
-        task: the file of the task that was played, unless it is a shipped one.
-
-    Raises:
-        CompileError: PD630 for a folder that is not a dataset, or is damaged; PD631 if it was recorded from another task,
-            or has too few worlds; what `load_task` raises.
+    `task`: the file of the task that was played, unless it is a shipped one. Raises CompileError: PD630 for a folder
+    that is not a dataset, or is damaged; PD631 if it was recorded from another task, or has too few worlds; what
+    `load_task` raises.
     """
     from powderdsl.datasets import Dataset
 

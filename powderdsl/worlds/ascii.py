@@ -24,11 +24,8 @@ def parse_ascii(
 
     Empty lines are skipped. Reports unknown characters (PD610), uneven rows (PD611), no cells or too many (PD607).
 
-    Args:
-        legend: names of elements by character, which override their glyphs.
-
-    Raises:
-        CompileError: PD604 if the legend names an unknown element.
+    `legend`: names of elements by character, which override their glyphs. Raises CompileError (PD604) if the legend
+    names an unknown element.
     """
     ids = _characters(elements, legend or {})
     rows: list[str] = []

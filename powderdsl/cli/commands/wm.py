@@ -123,8 +123,7 @@ def train_command(folder: Path | None, ignore_actions: bool, **values: Any) -> N
 def new_config(values: Mapping[str, Any], rules_of: Callable[..., str]) -> TrainConfig:
     """The settings of a new run on worlds. Raises CompileError and BadInput with what is wrong in them.
 
-    Args:
-        values: of the options. rules_of: the function of this name, or one that remembers its results.
+    `values`: of the options. `rules_of`: the function of this name, or one that remembers its results.
     """
     packs, held_out = values["packs"], values["held_out"]
     if packs and held_out:

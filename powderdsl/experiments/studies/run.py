@@ -53,8 +53,7 @@ class StudyRun:
     The folder has the study (``study.json``), the runs of each point (``runs/POINT``) and the evaluations of finished
     points (``done/POINT.json``). A process that works on a point locks ``runs/POINT/.lock``.
 
-    Args:
-        size: one of `SIZES`. threads: of each process.
+    `size`: one of `SIZES`. `threads`: of each process.
     """
 
     def __init__(self, study: Study, folder: Path, size: str, threads: int = 1):

@@ -125,8 +125,7 @@ class AddedPacks:
     def causes(self, pack: str, place: Span, ids: Sequence[int]) -> tuple[Cause, ...]:
         """The places in added packs that cause a conflict in `pack`; empty if it has the conflict without them.
 
-        Args:
-            place: the span at which the conflict is reported. ids: elements with which the rules meet.
+        `place`: the span at which the conflict is reported. `ids`: elements with which the rules meet.
         """
         packs = self.composition.packs
         words = frozenset(pack_words(packs[pack]))

@@ -282,8 +282,7 @@ def report_misspelled(
 ) -> None:
     """Warn of optional names that no pack defines but that are close to a name that some pack defines.
 
-    Args:
-        elsewhere: returns the words of packs that are not loaded, with the packs. Called only if it matters.
+    `elsewhere`: returns the words of packs that are not loaded, with the packs. Called only if it matters.
     """
     known: set[str] = set()
     for pack in (*packs, *ruleset.left_out.values()):

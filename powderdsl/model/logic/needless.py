@@ -308,8 +308,7 @@ def _brings(rule: Rule) -> dict[Offset, Expr]:
 def report_undecided(spans: Iterable[Span], reporter: Reporter) -> None:
     """Report the rules that took too much work to decide.
 
-    Args:
-        spans: rules, writes and values; repetitions count once.
+    `spans`: rules, writes and values; repetitions count once.
     """
     places = sorted(dict.fromkeys(spans), key=lambda span: (span.source.name, span.start))
     if not places:

@@ -51,9 +51,8 @@ class KernelSource:
 def cuda_source(program: Program, height: int, width: int, shared_limit: int) -> KernelSource:
     """The kernel of a program on planes for one size of grid.
 
-    Args:
-        shared_limit: bytes of shared memory that a block may have. If they do not suffice, fields go to global memory
-            first, then planes.
+    `shared_limit`: bytes of shared memory that a block may have. If they do not suffice, fields go to global memory
+    first, then planes.
     """
     layout = layout_of(program)
     row_words = -(-width // WARP)

@@ -54,8 +54,7 @@ def cells_of(agent: Agent, size: Size, rows: Tensor, columns: Tensor) -> Tensor:
 class Blocks:
     """Blocks of cells in the worlds of one simulator and size.
 
-    Args:
-        edges: of rows, then of columns: the first line of each bin's block and the one after its last, int64 [bins, 2].
+    `edges`: of rows, then of columns: the first line of each bin's block and the one after its last, int64 [bins, 2].
     """
 
     def __init__(self, sim: Simulator, size: Size, edges: tuple[Tensor, Tensor]):

@@ -40,8 +40,7 @@ def measures_in(scalars: Iterable[Expr]) -> tuple[Measure, ...]:
 class Meter:
     """Measures made executable for one ruleset and size.
 
-    Args:
-        fixed: the regions that are the same in all worlds, bool [1, H, W].
+    `fixed`: the regions that are the same in all worlds, bool [1, H, W].
     """
 
     def __init__(

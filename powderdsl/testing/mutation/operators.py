@@ -267,8 +267,7 @@ Changes = Iterator[Change]
 def mutants_of(pack: PackDecl, packs: Sequence_[PackDecl]) -> list[Mutant]:
     """All mutants of a pack's file, each text once, in the order of the file.
 
-    Args:
-        packs: all packs of the composition in which it is mutated.
+    `packs`: all packs of the composition in which it is mutated.
     """
     root = parse_yaml(pack.source, Reporter())
     mutants: dict[str, Mutant] = {}

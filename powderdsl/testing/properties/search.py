@@ -395,8 +395,7 @@ def shrink_while(judge: Judge, sample: Start, steps: int, tries: int, work: Work
 def smallest(start: Start, find: Callable[[list[Start]], Start | None]) -> Start:
     """The smallest start worlds that can be reached by removing one thing at a time.
 
-    Args:
-        find: one of some smaller starts that will do as well, or None.
+    `find`: one of some smaller starts that will do as well, or None.
     """
     while True:
         smaller = start
