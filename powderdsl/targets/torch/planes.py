@@ -58,7 +58,7 @@ class _Line:
     op: str = ""
 
 
-@dataclass
+@dataclass(eq=False)
 class _Block:
     """Planes that moved together: the name of the tensor, and its planes."""
 
@@ -368,14 +368,18 @@ class _Writer:
         """The text of the new words and fields."""
         outputs = [self.outputs.get(slot) for slot in self.planes]
         places = [self.blocks.get(node) if node else (self.words, i) for i, node in enumerate(outputs)]
-        home = places[0][0] if places and places[0] else None
-        if all(place is not None and place[0] is home and place[1] == i for i, place in enumerate(places)):
-            words = home.name if home else "words"
-        else:
-            changed = {i: self.of(node) for i, node in enumerate(outputs) if node}
-            names = "".join(f"{name}, " for name in changed.values())
-            text = f"k.replaced(words, {tuple(changed)}, ({names}))" if changed else "words"
-            words = self.name(text, "b", [*changed.values()])
+        best, changed = self.words, [i for i, place in enumerate(places) if place != (self.words, i)]
+        for place in places:
+            if place and len(place[0].planes) == len(places):
+                others = [i for i, other in enumerate(places) if other != (place[0], i)]
+                if len(others) < len(changed):
+                    best, changed = place[0], others
+        words = best.name
+        if changed:
+            new = [(i, outputs[i]) for i in changed]
+            names = [self.of(node) if node else self.name(f"words[{i}]") for i, node in new]
+            text = f"k.replaced({words}, {tuple(changed)}, ({', '.join(names)},))"
+            words = self.name(text, "b", [words, *names])
         floats = [
             self.name(f"k.all_cells({self.of(node)})", "f", (self.of(node),)) if node else f"fields[{i}]"
             for i, node in enumerate(map(self.outputs.get, self.fields))
