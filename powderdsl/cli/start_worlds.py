@@ -38,13 +38,8 @@ def start(
 ) -> World:
     """The worlds that a run starts from; each has random numbers of its own.
 
-    Args:
-        steps: the number of steps that follow. `auto` imports torch, and may compile native code, only if they are many.
-        how: passed on to `simulator.compile`.
-
-    Raises:
-        CompileError: a file or name cannot be used.
-        BadInput: options that do not go together.
+    Only if many steps follow, `auto` imports torch and may compile native code; `how` is passed on to `simulator.compile`.
+    Raises CompileError for a file or name that cannot be used, BadInput for options that do not go together.
     """
     # A drawn world comes first: compiling may import torch, and whoever mistyped a name should not wait for that.
     drawn = start_drawn(ruleset, name, size, batch, seed)

@@ -49,8 +49,7 @@ KINDS = {
 def define_symbols(typer: Typer) -> list[tuple[str, int, Span]]:
     """Complete a typer's symbols, whose names are known. Reports wrong definitions and leaves them out.
 
-    Returns:
-        The elements' own values of properties: property, id, span.
+    Returns the elements' own values of properties: property, id, span.
     """
     symbols = typer.symbols
     names, elements = symbols.names, symbols.elements

@@ -58,12 +58,8 @@ class WordProblem(Exception):
 def read_word(word: str, kind: Kind, ids: Mapping[str, int], *, ranges: bool = False) -> tuple[Bounds, ...]:
     """The bounds of each component of the value: two of a vector, one of other kinds.
 
-    Args:
-        ids: element ids by word.
-        ranges: numbers may be ranges, `1..3`.
-
-    Raises:
-        WordProblem: it is not a value of this kind.
+    `ids` are by the words of elements. With `ranges`, numbers may be ranges, `1..3`. Raises WordProblem if it is not a
+    value of this kind.
     """
     table = {"flag": FLAG_WORDS, "element": ids, "direction": _OCTANTS}.get(kind.name)
     values: list[Bounds] = []

@@ -340,11 +340,8 @@ class Episodes:
     def step(self, actions: Numbers, active: NDArray[np.bool_] | None = None) -> NDArray[np.bool_]:
         """One environment step of the episodes where `active`, bool [B], is set (None: of all).
 
-        Args:
-            actions: int64 [B]. One that is not valid at its stage is replaced by a random valid one.
-
-        Returns:
-            success, bool [B]: whether the worlds match their goals now.
+        Of actions, int64 [B], one that is not valid at its stage is replaced by a random valid one. Returns success, bool
+        [B]: whether the worlds match their goals now.
         """
         part, which = self._world, np.arange(self.count) if active is None else np.flatnonzero(active)
         stages = self.stage[which]

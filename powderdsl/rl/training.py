@@ -271,10 +271,8 @@ def clone(policy: ActorCriticPolicy, dataset: Dataset, config: TrainConfig) -> f
     """Behavior cloning: fit a policy to a dataset, its likelihood of the actions, and its values to the discounted returns.
 
     `config.init_epochs` times as many transitions are drawn as there are; which ones depends on `config.seed` alone. The
-    learning rate falls to zero.
-
-    Returns:
-        the loss, without that of the values: its mean over the last hundred updates at most.
+    learning rate falls to zero. Returns the loss, without that of the values: its mean over the last hundred updates at
+    most.
     """
     rows, returns = Transitions(dataset), _returns(dataset, config.gamma)
     updates = max(1, config.init_epochs * len(rows) // CLONING_BATCH)
@@ -318,9 +316,8 @@ def _returns(dataset: Dataset, gamma: float) -> NDArray[np.float32]:
 class _Keeper(BaseCallback):
     """Between rollouts, saves or keeps the latest state in memory, and plays the policy in held-out worlds.
 
-    Args:
-        held_out: these worlds, if any: ``held_out/return`` of the metrics. Training does not depend on them.
-        played: the interactions up to which they have been played; -1 for a run that begins.
+    Training does not depend on these worlds, if there are any: they give ``held_out/return`` of the metrics. `played` is
+    the interactions up to which they have been played; -1 for a run that begins.
     """
 
     def __init__(

@@ -63,12 +63,8 @@ def checked_values(
 ) -> Array:
     """Values [B, H, W] or [B, 2, H, W] in a slot's dtype, in new memory.
 
-    Args:
-        ids: the elements of the cells, some of which may lack the field or property.
-        fresh: the values in new cells of these elements.
-
-    Raises:
-        TypeError, ValueError: values that the slot cannot hold, or not in these cells.
+    `ids` are the elements of the cells, some of which may lack the field or property, and `fresh` the values in new cells
+    of these elements. Raises TypeError or ValueError for values that the slot cannot hold, or not in these cells.
     """
     if kind.sort(array) == "complex":
         raise TypeError(f"{slot.name} takes floats, found {array.dtype}")

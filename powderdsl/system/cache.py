@@ -107,11 +107,7 @@ def find(folder: Path, key: str) -> Path | None:
 def add(folder: Path, key: str, code: bytes, name: str) -> Path:
     """Write code into the cache; the path of its file.
 
-    Args:
-        key: hexadecimal digits. name: for `powderdsl cache list`.
-
-    Raises:
-        OSError: it cannot be written.
+    The key is hexadecimal digits, the name for `powderdsl cache list`. Raises OSError if it cannot be written.
     """
     for path in sorted(folder.glob(f"{key}-*")):
         path.unlink(missing_ok=True)  # damaged, or from another process that was as fast

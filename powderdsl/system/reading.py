@@ -52,14 +52,10 @@ def read_bytes(path: str | Path, limit: int) -> bytes:
 def parse_json(
     data: bytes, values: int = 1 << 19, hook: Callable[[dict[str, Any]], Any] | None = None
 ) -> Any:
-    """The value of a JSON text.
+    """The value of a JSON text. `hook` makes a value of each object, as `json.loads` takes it.
 
-    Args:
-        values: how many values it may hold: a value takes up to a hundred times as much memory as text.
-        hook: makes a value of each object, as `json.loads` takes it.
-
-    Raises:
-        ValueError: it is not JSON, holds more values, or is nested too deep.
+    Raises ValueError if it is not JSON, is nested too deep, or holds more values: each takes up to a hundred times as
+    much memory as text.
     """
     if data.count(b",") + data.count(b"[") + data.count(b"{") > values:
         raise ValueError(f"it has more than {values:,} values")

@@ -209,9 +209,8 @@ def mixed_program(
 ) -> Runnable:
     """The program of some segments. A single segment needs no wrapper.
 
-    Args:
-        packed: makes the program of a segment from its numeric program and the same program on bit planes.
-        cells: makes the program of a segment that bit planes cannot represent.
+    `packed` makes the program of a segment from its numeric program and the same program on bit planes, `cells` that of
+    a segment that bit planes cannot represent.
     """
     parts = [
         cells(segment.program) if segment.planes is None else packed(segment.program, segment.planes)

@@ -267,11 +267,8 @@ def compile_task(
 ) -> TaskProgram:
     """A program for one split of a task, or of the task of a name or path.
 
-    Args:
-        backend, device, threads: those of `powderdsl.compile`; one thread unless said otherwise.
-
-    Raises:
-        CompileError: PD801 for a split that the task does not have, PD701 for a backend or device that is not available.
+    Options are those of `powderdsl.compile`. Raises CompileError: PD801 for a split that the task does not have, PD701
+    for a backend or device that is not available.
     """
     loaded = task if isinstance(task, Task) else load_task(task)
     check_split(loaded, split)

@@ -222,11 +222,9 @@ class Strip:
 
 @torch.no_grad()
 def strips(predict: Network, worlds: TaskWorlds, *, step: int, times: int = 1, after: int = 0) -> list[Strip]:
-    """A strip for each variant of a split.
+    """A strip for each variant of a split, of worlds that have run `after` steps before.
 
-    Args:
-        step: steps that the network was trained to predict. times: how often it is applied to what it predicted.
-        after: steps that worlds have run before.
+    The network was trained to predict `step` steps, and is applied to what it predicted `times` times.
     """
     seeds = unseen_seeds(1, len(worlds.names)).to(worlds.device)
     world = worlds.later(worlds.start(seeds), after)

@@ -44,9 +44,7 @@ class Names:
     The first pack that defines a word keeps it as its global name. A pack that neither needs that one nor is needed by
     it may define the same word: its definition is known as ``pack.word``. So adding a pack renames nothing.
 
-    Args:
-        rename: by qualified name: where it is written, and the other global name.
-        reserved: words that name nothing.
+    `rename` gives, by qualified name, where it is written, and the other global name. Words `reserved` name nothing.
     """
 
     def __init__(

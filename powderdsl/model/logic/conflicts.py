@@ -140,11 +140,8 @@ def check_logic(
 ) -> tuple[tuple[Pass, ...], list[Span]]:
     """Report conflicts (errors), rules that never fire or do nothing (warnings), and inactive rules (notes).
 
-    Conflicts that come from `added` packs alone are resolved.
-
-    Returns:
-        The passes, with how conflicts are resolved, and the rules of which it takes too much work to decide whether
-        they fire or do anything.
+    Conflicts that come from `added` packs alone are resolved. Returns the passes, with how conflicts are resolved, and
+    the rules of which it takes too much work to decide whether they fire or do anything.
     """
     fires: Answers[Span] = Answers()
     useful: Answers[Span] = Answers()

@@ -63,8 +63,7 @@ def report_needless(
 ) -> list[Span]:
     """Report comparisons that ranges decide, rules that others always overrule, and writes that are always lost.
 
-    Returns:
-        The rules and writes that may have no effect, which takes too much work to decide.
+    Returns the rules and writes that may have no effect, which takes too much work to decide.
     """
     silent = [d.primary.span for d in reporter.diagnostics if d.code in SILENT and d.primary.span]
     _report_decided(passes, silent, reporter)
@@ -188,11 +187,8 @@ def report_undrawn(
 ) -> list[Span]:
     """Report chances of elements against which no rule draws there: mostly a tag is missing.
 
-    Args:
-        given: property, element id, and the span of the element's value.
-
-    Returns:
-        The chances that perhaps no rule draws, which takes too much work to decide.
+    Element values are property, element id, and span. Returns the chances that perhaps no rule draws, which takes too
+    much work to decide.
     """
     quick = _limited(facts)
     undecided = []

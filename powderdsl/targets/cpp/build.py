@@ -206,14 +206,8 @@ def build(source: str, ruleset: str = "", units: int = 1) -> Path:
     """The path of the library for a source, compiled unless it is in the cache.
 
     Safe with other processes and threads that do the same: one of them compiles, and the library is added atomically. A
-    damaged library is compiled again.
-
-    Args:
-        ruleset: a name for `powderdsl cache list`.
-        units: the number of parts of the source, selected by UNIT, that are compiled side by side.
-
-    Raises:
-        NoCompiler: none was found, or it failed.
+    damaged library is compiled again. `powderdsl cache list` shows the name `ruleset`. `units` parts of the source,
+    selected by UNIT, are compiled side by side. Raises NoCompiler if none was found, or it failed.
     """
     compiler, how = find_compiler(), current()
     flags, folder = flags_for(compiler, how.level), how.place()

@@ -123,12 +123,7 @@ class Batches:
 
 
 class Driver(Batches):
-    """Makes the functions that a host calls.
-
-    Args:
-        program: on bit planes.
-        tested: the ids whose presence passes test.
-    """
+    """Makes the functions that a host calls, for a program on bit planes. Passes test the presence of ids `tested`."""
 
     def __init__(self, library: Library, program: Program, passes: Sequence[Callee], tested: int):
         super().__init__(library)

@@ -50,9 +50,8 @@ def wasm_module(
 ) -> Module:
     """The module of a program on planes, for grids of this width; None: of any width below that of a word.
 
-    Args:
-        face: if given, the module is a world by itself (`standalone`) and exports only its functions.
-        memo: stores schedules of passes.
+    With a face, the module is a world by itself (`standalone`) and exports only its functions. A memo stores schedules
+    of passes.
     """
     schedules = [_schedule(program, pass_, memo) for pass_ in program.passes]
     memory = Memory(width, extent_of(schedules), layout_of(program))

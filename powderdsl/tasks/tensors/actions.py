@@ -88,9 +88,8 @@ class Blocks:
     ) -> Mapping[str, Tensor]:
         """A state with blocks, which `cells` gave, filled in the worlds of `where`, bool [B].
 
-        Args:
-            values: a value a world, [B] or [B, 2]. All are arrays for a packed state, and tensors for others.
-            reuse: write into the tensors of `state`.
+        There is a value a world, [B] or [B, 2]. All are arrays for a packed state, and tensors for others. `reuse` writes
+        into the tensors of `state`.
         """
         if isinstance(state, PackedState):  # only the blocks are written, nothing is unpacked
             numbers = {
@@ -144,9 +143,8 @@ class Hands:
     def act(self, world: World, actions: Tensor, *, reuse: bool) -> tuple[World, dict[str, Tensor]]:
         """The worlds after actions, int64 [B, 5], within their bounds. `reuse` writes into the world's own tensors.
 
-        Returns:
-            the worlds; int64 [B] each: the number of cells ``painted``, and 1 if an element was ``placed``, or cells
-            were ``blown``.
+        Beside them, int64 [B] each: the number of cells ``painted``, and 1 if an element was ``placed``, or cells were
+        ``blown``.
         """
         state, packed = world.state, isinstance(world.state, PackedState)
         numbers: Any = actions.numpy() if packed else actions

@@ -573,9 +573,7 @@ def distinguish(
 ) -> Distinction | None:
     """A small world on which two simulators differ, or None if none was found.
 
-    Args:
-        focus: ids of elements that are likely to matter: half of the worlds are made of them.
-        seed: other worlds for another seed, the same for the same.
+    Half of the worlds are made of elements `focus`, ids that are likely to matter. Equal seeds give the same worlds.
     """
     known = {slot.name for slot in second.slots}
     names = tuple(slot.name for slot in first.slots if slot.name in known)

@@ -298,9 +298,7 @@ def trials_for(chance: float) -> int:
 def chance_problem(start: World, steps: int, claims: Sequence[Often], seed: int) -> str:
     """A sentence about the first claim that counts contradict, or nothing.
 
-    Args:
-        start: one world.
-        seed: of all copies; each has an index of its own.
+    All copies of the one world `start` have the same seed, and each an index of its own.
     """
     chosen = [
         (claim, reference.evaluate(claim.before, world_context(start, claim.before))[0]) for claim in claims

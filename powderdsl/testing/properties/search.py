@@ -372,9 +372,8 @@ def shrink(
 def shrink_while(judge: Judge, sample: Start, steps: int, tries: int, work: Work) -> tuple[Start, int]:
     """The smallest world found for which the judge still says yes, and after how many steps.
 
-    Args:
-        tries: with how many seeds each smaller world is tried, its own first.
-        work: when it is used up, the search ends, even if something smaller might be found.
+    Each smaller world is tried with that many seeds, its own first. When the work is used up, the search ends, even if
+    something smaller might be found.
     """
     multiple = work.ruleset.side_multiple
 

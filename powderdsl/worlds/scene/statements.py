@@ -233,9 +233,7 @@ def read_amount(
 ) -> Expr | None:
     """Turn syntax into an integer expression with its range; constants are folded. Returns None after PD606 or PD802.
 
-    Args:
-        names: the amounts of names; None for a name whose definition has been reported.
-        what: the number in words, for messages.
+    `names` has None for a name whose definition has been reported. `what` is the number in words, for messages.
     """
     span, op = syntax.span, AMOUNTS.get(syntax.kind)
     if syntax.kind == "integer" and len(syntax.text) <= MAX_DIGITS:
