@@ -67,23 +67,23 @@ class Portable:
         if self.width % WORD:
             plane = plane & self.valid
         by = dx % self.width
-        return self._right(plane, by) | self._left(plane, self.width - by)
+        if self.across > 1 or not by:
+            return self._right(plane, by) | self._left(plane, self.width - by)
+        right = (plane >> by).bitwise_and_((1 << (WORD - by)) - 1)
+        return right.bitwise_or_(plane << (self.width - by))
 
     def _right(self, plane: Tensor, by: int) -> Tensor:
         words, bits = divmod(by, WORD)
         plane = self._words(plane, words)
         if not bits:
             return plane
-        lower = (plane >> bits) & ((1 << (WORD - bits)) - 1)
-        return lower | (self._words(plane, 1) << (WORD - bits)) if self.across > 1 else lower
+        return ((plane >> bits) & ((1 << (WORD - bits)) - 1)) | (self._words(plane, 1) << (WORD - bits))
 
     def _left(self, plane: Tensor, by: int) -> Tensor:
         words, bits = divmod(by, WORD)
         plane = self._words(plane, -words)
         if not bits:
             return plane
-        if self.across == 1:
-            return plane << bits
         return (plane << bits) | ((self._words(plane, -1) >> (WORD - bits)) & ((1 << bits) - 1))
 
     def _words(self, plane: Tensor, by: int) -> Tensor:
@@ -131,9 +131,8 @@ class Portable:
 
     def swap(self, planes: Tensor, movers: Tensor, dy: int, dx: int) -> Tensor:
         """Planes whose movers and targets are exchanged."""
-        targets = self.shift(movers, -dy, -dx)
-        there, back = self.shift(planes, dy, dx), self.shift(planes, -dy, -dx)
-        return (planes & ~(movers | targets)) | (there & movers) | (back & targets)
+        change = self.shift(planes, dy, dx).bitwise_xor_(planes).bitwise_and_(movers)
+        return self.shift(change, -dy, -dx).bitwise_xor_(change).bitwise_xor_(planes)
 
     def left(self, *kinds: Leftover) -> Any:
         """What movers leave behind in each plane, in the form that `leave` takes."""
@@ -188,9 +187,10 @@ class Portable:
         if not 0 < limit < 1 << bits:
             return self.everywhere if limit > 0 else self.nowhere
         low = (limit & -limit).bit_length() - 1
-        below = draws[bits - low - 1]
+        below = draws[bits - low - 1].clone()
         for i in range(low + 1, bits):
-            below = below | draws[bits - 1 - i] if limit >> i & 1 else below & draws[bits - 1 - i]
+            draw = draws[bits - 1 - i]
+            below = below.bitwise_or_(draw) if limit >> i & 1 else below.bitwise_and_(draw)
         return below
 
     def below(self, draws: Sequence[Tensor], limit: int | Sequence[Tensor]) -> Tensor:
@@ -322,20 +322,6 @@ class Eager(Portable):
             words[i] = plane
         return words
 
-    def columns(self, plane: Tensor, dx: int) -> Tensor:
-        by = dx % self.width
-        if self.across > 1 or not by:
-            return super().columns(plane, dx)
-        plane = self.whole(plane)
-        if self.width < WORD:
-            plane = plane & self.valid
-        right = (plane >> by).bitwise_and_((1 << (WORD - by)) - 1)
-        return right.bitwise_or_(plane << (self.width - by))
-
-    def swap(self, planes: Tensor, movers: Tensor, dy: int, dx: int) -> Tensor:
-        change = self.shift(planes, dy, dx).bitwise_xor_(planes).bitwise_and_(movers)
-        return self.shift(change, -dy, -dx).bitwise_xor_(change).bitwise_xor_(planes)
-
     def left(self, *kinds: Leftover) -> Any:
         return kinds
 
@@ -354,16 +340,6 @@ class Eager(Portable):
         if ("numbers", bits) not in self.fixed:
             self.fixed["numbers", bits] = self._numbers(bits, slice(None))
         return self._hashed(self.fixed["numbers", bits], keys).view(torch.int64)
-
-    def chance(self, draws: Sequence[Tensor], limit: int, bits: int) -> Tensor:
-        if not 0 < limit < 1 << bits or limit & (limit - 1) == 0:
-            return super().chance(draws, limit, bits)
-        low = (limit & -limit).bit_length() - 1
-        below = draws[bits - low - 1].clone()
-        for i in range(low + 1, bits):
-            draw = draws[bits - 1 - i]
-            below = below.bitwise_or_(draw) if limit >> i & 1 else below.bitwise_and_(draw)
-        return below
 
     def to_cells(self, array: Tensor) -> Tensor:
         return array.movedim(-3, -2)
