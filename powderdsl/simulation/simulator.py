@@ -365,8 +365,9 @@ class Simulator:
     def numbers(self, values: Any, name: str, batch: int) -> Array:
         """Integers of 0 or more, one for all worlds or one a world, as a new array int64 [B].
 
-        Raises TypeError if they are not integers, ValueError for a wrong shape, or a negative number. Messages call
-        them `name`.
+        Raises:
+            TypeError: they are not integers.
+            ValueError: a wrong shape, or a negative number. Messages call them `name`.
         """
         xp = self.kind.xp
         array = xp.asarray(self._integers(values, name), dtype=xp.int64)
@@ -539,7 +540,8 @@ class Simulator:
     def parameters(self, params: Mapping[str, Any], batch: int) -> dict[str, Array]:
         """All parameters of `batch` worlds by name, new arrays float64 [B]: `params`, as in `step`, and defaults.
 
-        Raises as `step`.
+        Raises:
+            KeyError, TypeError, ValueError: as in `step`.
         """
         return {name: self.kind.copied(value) for name, value in self._parameters(params, batch).items()}
 
