@@ -239,13 +239,13 @@ def disagreement(world: World, other: World, most: int = 8) -> str:
     """The first place where two simulators differ, in calls of up to `most` steps; empty if they are equal."""
     ahead, wanted = world, other
     for steps in range(1, most + 1):
-        ahead, wanted = (one.sim.step(one) for one in (ahead, wanted))
+        ahead, wanted = (side.sim.step(side) for side in (ahead, wanted))
         for end, name in product((ahead, world.sim.step(world, steps)), wanted.state):
-            values = [one.state[name].cpu().numpy() for one in (end, wanted)]
+            values = [side.state[name].cpu().numpy() for side in (end, wanted)]
             for place in np.argwhere(values[0] != values[1])[:1]:
                 index, *_, row, column = place.tolist()
-                found = " instead of ".join(str(array[tuple(place)]) for array in values)
-                return f"{name} of world {index}, cell ({row}, {column}), step {steps}: {found}"
+                contents = " instead of ".join(str(array[tuple(place)]) for array in values)
+                return f"{name} of world {index}, cell ({row}, {column}), step {steps}: {contents}"
     return ""
 
 
@@ -331,7 +331,8 @@ def measuring(plan: Plan, cells: list[CellFigures]) -> Iterator[tuple[str, Cell]
         except Exception as error:
             if not plan.check or figures.cell.backend in programs:
                 raise
-            lines = [line for one in getattr(error, "diagnostics", ()) for line in (one.message, *one.notes)]
+            errors = getattr(error, "diagnostics", ())
+            lines = [line for problem in errors for line in (problem.message, *problem.notes)]
             figures.check = ": ".join(filter(None, lines)) or f"{type(error).__name__}: {error}"
 
     threads, programs = torch.get_num_threads(), {program.name: program for program in plan.programs}
@@ -425,8 +426,8 @@ class _Subject:
             self.sim.step(self.world, steps)
             now(self.sim.device)
         on_cpu = kind == ProfilerActivity.CPU
-        events = [one for one in trace.events() if (one.device_type.name == "CPU") == on_cpu]
-        return sum(not (one.cpu_children or one.is_user_annotation) for one in events) / steps
+        events = [event for event in trace.events() if (event.device_type.name == "CPU") == on_cpu]
+        return sum(not (event.cpu_children or event.is_user_annotation) for event in events) / steps
 
     def profile(self) -> None:
         """Measure the microseconds a world and step of each pass, if the backend can report them."""

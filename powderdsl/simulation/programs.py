@@ -118,17 +118,17 @@ def make_program(
             "wasm", _plain_program(ruleset, kind, memo), lambda: ReferenceProgram(ruleset, kind)
         )
     from powderdsl.targets.torch.packed import PlanesProgram
-    from powderdsl.targets.torch.program import TorchProgram
+    from powderdsl.targets.torch.program import TorchProgram, packed_program
 
     # Made on first use: native code that was compiled before needs none of them.
     lowered, segments = cache(lambda: lower(ruleset)), cache(lambda: segments_of(ruleset))
     cells = cache(lambda: TorchProgram(lowered(), device))
 
-    def packed(make: Callable[[Program, Program], Runnable]) -> Runnable:
-        return mixed_program(segments(), make, lambda program: TorchProgram(program, device))
-
-    wasm = cache(lambda: packed(lambda program, planes: WasmProgram(program, planes, kind)))
-    torch = cache(lambda: packed(partial(PlanesProgram, device=device, fuse=backend == "torch-fused")))
+    wasm = cache(lambda: packed_program(segments(), device, partial(WasmProgram, kind=kind)))
+    fuse = backend == "torch-fused"
+    torch = cache(
+        lambda: packed_program(segments(), device, partial(PlanesProgram, device=device, fuse=fuse))
+    )
     if backend == "wasm":
         return BackendProgram("wasm", wasm(), cells)
     if backend == "native" or (backend == "auto" and kind.on_cpu):
@@ -140,8 +140,8 @@ def make_program(
         from powderdsl.targets.cuda.program import cuda_program
 
         with suppress(CompileError) if backend == "auto" else nullcontext():
-            return BackendProgram("cuda", cuda_program(lowered(), device), cells)
-    if backend == "torch-fused" and kind.on_cpu:
+            return BackendProgram("cuda", cuda_program(segments(), device), cells)
+    if fuse and kind.on_cpu:
         from powderdsl.targets.cpp.build import NoCompiler, find_compiler
         from powderdsl.targets.torch.fuse import not_compiled
 
@@ -151,7 +151,7 @@ def make_program(
             raise not_compiled(str(error)) from None
     if backend == "torch-cells":
         return BackendProgram(backend, cells())
-    return BackendProgram(backend if backend == "torch-fused" else "torch", torch(), cells)
+    return BackendProgram(backend if fuse else "torch", torch(), cells)
 
 
 @collection_paused()

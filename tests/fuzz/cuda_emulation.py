@@ -10,6 +10,7 @@ import tempfile
 from pathlib import Path
 
 from powderdsl.compiler import lower
+from powderdsl.ir.bits import segments
 from powderdsl.model.types import Ruleset
 from powderdsl.simulation.programs import BackendProgram
 from powderdsl.simulation.simulator import Simulator
@@ -68,7 +69,7 @@ class EmulatedSimulator(Simulator):
         self.backend = EMULATED
         compile = compiler_for(folder, order)
         program = packed_program(
-            lower(ruleset),
+            segments(lower(ruleset)),
             self.device,
             lambda cells, planes: CudaProgram(cells, planes, compile, shared_limit),
         )

@@ -106,7 +106,7 @@ def command(
         print_json(report_data(report))
     else:
         click.echo(report_text(report))
-    return OK if all(one.check in ("", EQUAL) for one in figures) else FAILED
+    return OK if all(cell.check in ("", EQUAL) for cell in figures) else FAILED
 
 
 def _usual_backends(device: str, check: bool) -> tuple[str, ...]:

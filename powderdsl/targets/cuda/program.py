@@ -19,6 +19,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from powderdsl.ir.bits import Segment
 from powderdsl.ir.ops import Program
 from powderdsl.system import cache as native_cache
 from powderdsl.targets.cuda.source import KernelSource, cuda_source
@@ -163,7 +164,7 @@ Compile = Callable[[KernelSource], Launch]
 """Makes a kernel from its source, for one device."""
 
 
-def cuda_program(program: Program, device: torch.device) -> Runnable:
+def cuda_program(segments: Sequence[Segment], device: torch.device) -> Runnable:
     """A program for a CUDA device; passes that bit planes cannot represent run on cells.
 
     Raises CompileError (PD701) if the device, the driver or NVRTC is missing, here or when a kernel is made.
@@ -186,7 +187,7 @@ def cuda_program(program: Program, device: torch.device) -> Runnable:
     except NoCuda as error:
         raise unavailable("cuda", str(error), _HELP) from None
     shared = limits.shared_memory_per_block_optin
-    return packed_program(program, device, lambda cells, planes: CudaProgram(cells, planes, compile, shared))
+    return packed_program(segments, device, lambda cells, planes: CudaProgram(cells, planes, compile, shared))
 
 
 class DeviceState(PackedArrays):

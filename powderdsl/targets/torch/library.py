@@ -4,7 +4,7 @@ Words are int64, [..., H, B, K]: bit x % 64 of word x // 64 is column x. Bits be
 parameters, which all cells share, are broadcast. There are two libraries with the same operations:
 
 - `Portable`: for compilation and for any device. Cells are [H, W, B], so that neighbors lie along outer dimensions; masks of
-  cells are bool.
+  cells are planes.
 - `Eager`: for CPUs without compilation. Cells are [H, B, W], so that the bytes of a word lie in order; masks of cells are
   int32 of all ones or zeros, since `torch.where` branches for each cell.
 """

@@ -13,13 +13,16 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
-from powderdsl.ir.ops import COMMUTATIVE, OPS, REAL, Node, PassGraph, Program, needed
+from powderdsl.ir.ops import COMMUTATIVE, OPS, REAL, Node, Offset, PassGraph, Program, needed
 from powderdsl.schedule.types import leftover
 from powderdsl.targets.layout import param_key
 from powderdsl.targets.torch.source import comment_of, with_deletions
 
 Key = tuple[Any, ...]
-"""An input of a pass: `draws`, `limit`, `bit`, `real`, `row`, `column`, `step`, `inside`, `inside_mask` or `left`, and what it is of."""
+"""An input of a pass: its kind, and which input of that kind.
+
+Kinds are `draws`, `limit`, `bit`, `real`, `step` and those of `packed.FIXED`.
+"""
 
 
 class Source(NamedTuple):
@@ -66,7 +69,6 @@ class _Block:
     planes: list[Node | None]
 
 
-_GATES = {"and": "&", "or": "|", "xor": "^"}
 _SHARED = ("chance", "below_planes", "param", "coordinate", "inside")
 """Operations whose result may be the memory of an input."""
 
@@ -84,9 +86,12 @@ _IN_PLACE = {
     "neg": "{0}.neg_()",
     "abs": "{0}.abs_()",
 }
-"""Operations that may overwrite their first argument; the others may overwrite the second one instead, unless it is `sub`."""
+"""Operations that may overwrite their first argument, or the second if they are commutative."""
+
 _FLAGS = {
-    **{op: f"{{0}} {sign} {{1}}" for op, sign in _GATES.items()},
+    "and": "{0} & {1}",
+    "or": "{0} | {1}",
+    "xor": "{0} ^ {1}",
     "not": "~{0}",
     "select": "{2} ^ ({0} & ({1} ^ {2}))",
 }
@@ -108,7 +113,6 @@ _REALS = {
 
 class _Writer:
     def __init__(self, program: Program, pass_: PassGraph):
-        self.pass_ = pass_
         self.outputs = dict(pass_.outputs)
         slots = [(slot.name, slot.type == REAL) for slot in program.slots]
         self.planes = [name for name, is_real in slots if not is_real]
@@ -131,30 +135,31 @@ class _Writer:
         nodes = needed(self.outputs.values(), self.arguments)
         position = {node: i for i, node in enumerate(nodes)}
         users: dict[Node, list[Node]] = {node: [] for node in nodes}
-        missing = {node: len(dict.fromkeys(args)) for node, args in nodes.items()}
+        missing = {node: len(set(args)) for node, args in nodes.items()}
         for node, args in nodes.items():
             for arg in dict.fromkeys(args):
                 users[arg].append(node)
         ready = [position[node] for node in nodes if not missing[node]]
-        moves: dict[Key, list[Node]] = {}
+        movements: dict[Key, list[Node]] = {}
         order = [*nodes]
         place = ""
-        while ready or moves:
+        while ready or movements:
+            key = None
             if ready:
                 group = [order[heapq.heappop(ready)]]
-                key = self.movement(group[0])
-                if key is not None:
-                    moves.setdefault(key, []).append(group[0])
+                if (waiting := self.movement(group[0])) is not None:
+                    movements.setdefault(waiting, []).append(group[0])
                     continue
             else:
-                group = moves.pop(next(iter(moves)))
+                key = next(iter(movements))
+                group = sorted(movements.pop(key), key=position.__getitem__)
             if group[0].places and group[0].places[0] != place:
                 place = group[0].places[0]
                 self.lines.append(_Line("", f"# {comment_of(place)}"))
-            if self.movement(group[0]) is not None:
-                self.move(sorted(group, key=position.__getitem__))
-            else:
+            if key is None:
                 self.node(group[0])
+            else:
+                self.move(group, *key)
             for done in group:
                 for user in users[done]:
                     missing[user] -= 1
@@ -174,7 +179,7 @@ class _Writer:
         return node.args
 
     def movement(self, node: Node) -> Key | None:
-        """What planes that move together have in common; None for other nodes."""
+        """What planes that move together share: operation, offset, movers, and whether the rest is simple; else None."""
         if node.op not in ("swap", "arrive"):
             return None
         kind = leftover(node.args[0], node.args[2], node.args[1])
@@ -318,17 +323,15 @@ class _Writer:
         if None in keys or keys[0] is None:
             return ()
         name, threshold, _ = keys[0]
-        whole = threshold is not None and keys == [
-            (name, threshold, bit) for bit in range(threshold.bits, -1, -1)
-        ]
-        return (name, threshold) if whole else ()
+        if threshold is None or keys != [(name, threshold, bit) for bit in range(threshold.bits, -1, -1)]:
+            return ()
+        return name, threshold
 
     # Movements
 
-    def move(self, group: list[Node]) -> None:
+    def move(self, group: list[Node], op: str, offset: Offset, movers: Node, simple: bool) -> None:
         """Write planes that move together, as one tensor."""
-        op, (dy, dx), movers, simple = self.movement(group[0]) or ("", (0, 0), None, False)
-        assert movers is not None
+        dy, dx = offset
         contents = self.block([node.args[0] for node in group])
         mask = self.of(movers)
         args = [contents.name, mask]

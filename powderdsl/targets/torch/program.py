@@ -6,7 +6,7 @@ are bool, integers int32, floats float32, all [B, H, W] or broadcastable to it.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
-from powderdsl.ir.bits import segments
+from powderdsl.ir.bits import Segment
 from powderdsl.ir.ops import SNAP, Program, Threshold, kernel_rows
 from powderdsl.system.cache import collection_paused
 from powderdsl.system.random import MASK, base_keys, mix
@@ -225,10 +225,10 @@ class TorchProgram:
 
 @collection_paused()
 def packed_program(
-    program: Program, device: torch.device, make: Callable[[Program, Program], Runnable]
+    segments: Sequence[Segment], device: torch.device, make: Callable[[Program, Program], Runnable]
 ) -> Runnable:
     """A program on bit planes, see `mixed_program`; passes that bit planes cannot represent run on torch tensors."""
-    return mixed_program(segments(program), make, lambda cells: TorchProgram(cells, device))
+    return mixed_program(segments, make, lambda cells: TorchProgram(cells, device))
 
 
 def compiled(source: str, name: str, constants: Mapping[str, object], device: torch.device) -> PassFunction:
