@@ -12,9 +12,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 from powderdsl.diagnostics import CompileError, Diagnostic, Label
-from powderdsl.system.fingerprint import fingerprint
 from powderdsl.system.reading import check_links, parse_json, read_bytes
-from powderdsl.system.settings import Limits, check_settings, read_record
+from powderdsl.system.settings import Limits, check_settings, fingerprint, read_record
 from powderdsl.system.writing import failure, write_text
 from powderdsl.tasks.task import BLOW, NO_CHANGE, Task
 

@@ -19,8 +19,8 @@ from powderdsl.datasets.manifest import Recipe, changed_params, damaged, read_re
 from powderdsl.datasets.recorder import add_shard, begin_manifest, lock_place
 from powderdsl.diagnostics import CompileError
 from powderdsl.envs import env_id
-from powderdsl.system.fingerprint import fingerprint
 from powderdsl.system.packages import require
+from powderdsl.system.settings import fingerprint
 from powderdsl.system.writing import failure, scratch_folder, writing
 from powderdsl.tasks.shipped import load_task, shipped_tasks
 

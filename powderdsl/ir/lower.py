@@ -24,8 +24,8 @@ from powderdsl.ir.ops import (
     component_names,
     integer,
     kernel_rows,
+    single,
 )
-from powderdsl.ir.single import single
 from powderdsl.model.logic.satisfy import Budget, satisfiable
 from powderdsl.model.operations import OPERATIONS
 from powderdsl.model.state import Slot, scratch_slots, slots

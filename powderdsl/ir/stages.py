@@ -13,8 +13,21 @@ from math import frexp
 from typing import NamedTuple
 
 from powderdsl.ir.bits import simpler
-from powderdsl.ir.ops import OPS, REAL, Graph, Node, PassGraph, Program, Type, conjuncts, nodes_of, verify
-from powderdsl.ir.single import single, square_root, stepped
+from powderdsl.ir.ops import (
+    OPS,
+    REAL,
+    Graph,
+    Node,
+    PassGraph,
+    Program,
+    Type,
+    conjuncts,
+    nodes_of,
+    single,
+    square_root,
+    stepped,
+    verify,
+)
 
 Rewrite = Callable[[Node, Graph], Node | None]
 """From a node to its replacement, or None for no change."""

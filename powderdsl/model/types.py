@@ -14,7 +14,7 @@ from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 from powderdsl.diagnostics import Span
-from powderdsl.system.fingerprint import UNMEANING, fingerprint
+from powderdsl.system.settings import UNMEANING, fingerprint
 
 if TYPE_CHECKING:
     from powderdsl.model.declarations import PackDecl, RulesetDecl

@@ -21,8 +21,8 @@ from powderdsl.experiments.runs import lock_folder
 from powderdsl.ogbench.episodes import LevelProgram, keyed
 from powderdsl.ogbench.levels import FAMILY, VERSION, Level
 from powderdsl.system.archives import BadArchive, Parts, open_archive, write_archive
-from powderdsl.system.fingerprint import fingerprint
 from powderdsl.system.reading import read_json
+from powderdsl.system.settings import fingerprint
 from powderdsl.system.writing import failure, replacing, write_text, writing
 
 Array = NDArray[Any]

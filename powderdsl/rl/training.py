@@ -44,7 +44,7 @@ from powderdsl.rl.config import TrainConfig, check_task, from_json
 from powderdsl.rl.evaluation import play
 from powderdsl.rl.policies import TrainedPolicy, policy_of
 from powderdsl.simulation.observe import Observer
-from powderdsl.system.fingerprint import fingerprint
+from powderdsl.system.settings import fingerprint
 from powderdsl.system.writing import failure
 from powderdsl.tasks.episodes import TaskProgram, compile_task
 from powderdsl.tasks.shipped import load_task

@@ -7,8 +7,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
-from powderdsl.ir.ops import FLAG, OPS, REAL, Graph, Node, ordered, taken
-from powderdsl.ir.single import single
+from powderdsl.ir.ops import FLAG, OPS, REAL, Graph, Node, ordered, single, taken
 from powderdsl.schedule.floats import match_slot_choices
 from powderdsl.schedule.types import (
     ANSWER,

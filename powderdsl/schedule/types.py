@@ -241,16 +241,12 @@ class Schedule:
         return [node for statement in flat(self.body) for node in statement.values] + self.results
 
 
-# Values
-
-SCHEDULE_OPS = frozenset({"load", "below_param", "any", "some", "when", "led", "live", "present"})
-"""Operations that only schedules have.
-
-`load`: the value of a variable. `below_param`: a draw below a parameter. `any` (flag): true if the flag holds in some
-cell; `some` (flags): true if any of them does. `when` (flag, flag): both, the second computed only in words where the
-first holds somewhere; `led` (comparison, comparison): the same in cells. `live` (field), attribute (rows, reach): true if
-the field may be nonzero that many rows down, within `reach` columns. `present`, attribute ids: true if one of them is
-present."""
+# Values. Operations that only schedules have:
+#
+# `load`: the value of a variable. `below_param`: a draw below a parameter. `any` (flag): true if the flag holds in some
+# cell; `some` (flags): true if any of them does. `when` (flag, flag): both, the second computed only in words where the
+# first holds somewhere; `led` (comparison, comparison): the same in cells. `live` (field), attribute (rows, reach): true if
+# the field may be nonzero that many rows down, within `reach` columns. `present`, attribute ids: true if one is present.
 
 
 def load(graph: Graph, var: Var) -> Node:

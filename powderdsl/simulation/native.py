@@ -27,7 +27,7 @@ from powderdsl.diagnostics import CompileError
 from powderdsl.ir.bits import Segment
 from powderdsl.model.types import Ruleset
 from powderdsl.system.cache import code_hash
-from powderdsl.system.fingerprint import fingerprint
+from powderdsl.system.settings import fingerprint
 from powderdsl.targets.array_kind import Array
 from powderdsl.targets.cpp.build import (
     INSTALL,

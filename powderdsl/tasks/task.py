@@ -11,7 +11,7 @@ from typing import Any
 from powderdsl.diagnostics import Span
 from powderdsl.model.state import Slot
 from powderdsl.model.types import Expr, Ruleset
-from powderdsl.system.fingerprint import UNMEANING
+from powderdsl.system.settings import UNMEANING
 from powderdsl.worlds.raster import Shape, Size
 
 BLOW = -1

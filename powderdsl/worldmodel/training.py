@@ -37,9 +37,9 @@ from powderdsl.experiments.runs import (
 )
 from powderdsl.model.composition.compose import Palette
 from powderdsl.model.types import Ruleset
-from powderdsl.system.fingerprint import fingerprint
 from powderdsl.system.interrupts import delay_signal
 from powderdsl.system.random import MASK, base_keys, mix
+from powderdsl.system.settings import fingerprint
 from powderdsl.system.writing import failure
 from powderdsl.tasks.shipped import load_task
 from powderdsl.worldmodel.config import HERE, DataConfig, Machine, TrainConfig

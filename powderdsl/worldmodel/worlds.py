@@ -35,8 +35,8 @@ from powderdsl.model.definitions import set_params
 from powderdsl.model.types import Ruleset
 from powderdsl.simulation.programs import starting_backend
 from powderdsl.simulation.simulator import World
-from powderdsl.system.fingerprint import fingerprint
 from powderdsl.system.random import MASK, base_keys, mix
+from powderdsl.system.settings import fingerprint
 from powderdsl.system.writing import failure
 from powderdsl.tasks.episodes import TaskProgram, compile_task
 from powderdsl.tasks.shipped import check_split, load_task, shipped_tasks

@@ -18,7 +18,7 @@ from powderdsl.experiments.runs import read_metrics
 from powderdsl.rl import evaluate, load_policy, train
 from powderdsl.rl.policies import BinPolicy, fcn_policy
 from powderdsl.syntax.sources import shipped
-from powderdsl.system.fingerprint import fingerprint
+from powderdsl.system.settings import fingerprint
 from powderdsl.tasks.episodes import compile_task
 from powderdsl.tasks.shipped import load_task, shipped_tasks
 from tests.refusals import refusal, refused_codes

@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from powderdsl.ir.ops import FLAG, OPS, REAL, InvalidIR, Node, Type, demand, ordered
 from powderdsl.schedule.types import (
     ANSWER,
-    SCHEDULE_OPS,
     Compute,
     Guard,
     Move,
@@ -21,6 +20,9 @@ from powderdsl.schedule.types import (
     loaded,
     read_elsewhere,
 )
+
+SCHEDULE_OPS = {"load", "below_param", "any", "some", "when", "led", "live", "present"}
+"""Operations that only schedules have."""
 
 _KINDS = ("flag", "real", ANSWER.name)
 

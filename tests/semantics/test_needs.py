@@ -10,7 +10,7 @@ import pytest
 import powderdsl
 from powderdsl.compiler import load_with_diagnostics
 from powderdsl.diagnostics import CompileError
-from powderdsl.system.fingerprint import fingerprint
+from powderdsl.system.settings import fingerprint
 from tests.cli.commands import powderdsl as run
 
 SEED = 'pack: seed\nneeds: [core, loam]\nelements:\n  seed: {id: 40, color: "#112233"}\n'

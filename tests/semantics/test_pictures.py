@@ -15,7 +15,7 @@ import powderdsl
 from powderdsl.diagnostics import CompileError
 from powderdsl.model.types import Ruleset
 from powderdsl.simulation.draw import palette, ramps, rgb
-from powderdsl.system.fingerprint import fingerprint
+from powderdsl.system.settings import fingerprint
 from powderdsl.testing.generators.cases import Choices, random_start
 from powderdsl.worlds.store import load_world
 from tests.cli.commands import powderdsl as run_command

@@ -13,7 +13,7 @@ import torch
 from powderdsl.diagnostics import CompileError, Reporter, Severity, Source
 from powderdsl.experiments.runs import Estimate
 from powderdsl.rl.evaluation import evaluate
-from powderdsl.system.fingerprint import fingerprint
+from powderdsl.system.settings import fingerprint
 from powderdsl.tasks.episodes import Episodes, TaskProgram, compile_task
 from powderdsl.tasks.file import read_task
 from powderdsl.tasks.players import ExpertPlayer, best_plans

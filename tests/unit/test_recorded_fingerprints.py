@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from powderdsl.diagnostics import Reporter, Source
-from powderdsl.system.fingerprint import fingerprint
+from powderdsl.system.settings import fingerprint
 from powderdsl.tasks.file import read_task
 
 TASK = """task: yard

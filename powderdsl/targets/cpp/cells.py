@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 
-from powderdsl.ir.ops import FLAG, REAL, Node, ordered
-from powderdsl.ir.single import all_ones, single
+from powderdsl.ir.ops import FLAG, REAL, Node, all_ones, ordered, single
 from powderdsl.schedule.join import keeps_values
 from powderdsl.schedule.rows import ANY_PASS, RowLoop, Rows, region_of, rows_of
 from powderdsl.schedule.types import Sweeps, alternatives, is_zero

@@ -13,7 +13,6 @@ from functools import partial
 
 from powderdsl.ir.ops import REAL, Program
 from powderdsl.system.random import MASK, START_0, START_1
-from powderdsl.targets.wasm.batches import HEADER
 from powderdsl.targets.wasm.binary import (
     F32,
     I32,
@@ -29,6 +28,7 @@ from powderdsl.targets.wasm.binary import (
     op,
     vector,
 )
+from powderdsl.targets.wasm.host import HEADER
 from powderdsl.targets.wasm.library import (
     GOLDEN,
     GROUPS,

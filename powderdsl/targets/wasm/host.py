@@ -1,4 +1,4 @@
-"""Hosts, which compile and run modules of WebAssembly that import nothing and export `memory`.
+"""Hosts, which compile and run modules of WebAssembly that import nothing and export `memory`; batches in that memory.
 
 The host is wasmtime in this process (`wasmtime_host`); in Pyodide, it is the browser or Node.js.
 """
@@ -8,6 +8,8 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable
 from typing import Any, Protocol
+
+from powderdsl.targets.layout import Layout, Piece
 
 TOO_LARGE = "the worlds do not fit into the memory of a WebAssembly module"
 
@@ -88,3 +90,23 @@ class BrowserInstance:
 
     def memory_size(self) -> int:
         return int(self._memory.buffer.byteLength)
+
+
+# The layout of batches of worlds
+
+HEADER = 16
+"""Bytes of numbers before the contents of planes, fields and batches."""
+
+WORLDS, GROUPS = 0, 4
+"""Where the header of a batch has its numbers of worlds and of groups, i32."""
+
+
+def aligned(count: int, by: int = 16) -> int:
+    """The next multiple of `by`."""
+    return -(-count // by) * by
+
+
+def numbers_of(piece: Piece, layout: Layout, size: int) -> tuple[int, int, int, int]:
+    """The arguments of `load` and `store` for a piece of the state whose cells have `size` bytes."""
+    slot, planes, signed = layout.home(piece)
+    return slot if planes else len(layout.planes) + slot, planes, int(signed), size

@@ -24,8 +24,7 @@ from powderdsl.schedule.rows import chains_of
 from powderdsl.schedule.types import Move, Schedule, Sweeps, flat, reads_of
 from powderdsl.system.random import MASK
 from powderdsl.targets.layout import Layout
-from powderdsl.targets.wasm import batches
-from powderdsl.targets.wasm.batches import HEADER, aligned
+from powderdsl.targets.wasm import host
 from powderdsl.targets.wasm.binary import (
     I32,
     I64,
@@ -43,6 +42,7 @@ from powderdsl.targets.wasm.binary import (
     op,
     vector,
 )
+from powderdsl.targets.wasm.host import HEADER, aligned
 
 WORD, LANES = 64, 2
 REFS, SOME, HALOED, NEXT = (Member("i32.load", at) for at in (0, 4, 8, 12))
@@ -55,7 +55,7 @@ REFS_SOME = Member("i64.load", 0)
 LIVE = Member("i32.load8_u", HEADER)
 """The live byte of a line, at the field's address plus the line's number."""
 
-WORLDS, GROUPS = Member("i32.load", batches.WORLDS), Member("i32.load", batches.GROUPS)
+WORLDS, GROUPS = Member("i32.load", host.WORLDS), Member("i32.load", host.GROUPS)
 
 PAGE = 1 << 16
 GOLDEN, FIRST, SECOND = 0x9E3779B1, 0x7FEB352D, 0x846CA68B

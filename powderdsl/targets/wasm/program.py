@@ -17,8 +17,7 @@ from powderdsl.system.cache import Memo, persistent
 from powderdsl.targets.array_kind import Array, ArrayKind
 from powderdsl.targets.job import Job, Like, OwnedBatch, like_of, shape_of
 from powderdsl.targets.layout import layout_of, parameters, pieces
-from powderdsl.targets.wasm.batches import GROUPS, HEADER, aligned, numbers_of
-from powderdsl.targets.wasm.host import Compiled, this_host
+from powderdsl.targets.wasm.host import GROUPS, HEADER, Compiled, aligned, numbers_of, this_host
 
 ROOM = 1 << 30
 """Bytes of memory from which an instance takes no new batches. The other half remains for its batches to step and read."""

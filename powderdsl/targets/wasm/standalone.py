@@ -28,9 +28,9 @@ from typing import TypeVar
 
 from powderdsl.ir.ops import SNAP, Threshold
 from powderdsl.targets.layout import Piece
-from powderdsl.targets.wasm.batches import HEADER, aligned, numbers_of
 from powderdsl.targets.wasm.binary import F64, I32, Callee, Local, Value, body, const, load, op
 from powderdsl.targets.wasm.driver import Batches
+from powderdsl.targets.wasm.host import HEADER, aligned, numbers_of
 from powderdsl.targets.wasm.library import PAGE, Library, counted, either
 
 Item = TypeVar("Item")

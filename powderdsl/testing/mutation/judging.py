@@ -40,8 +40,8 @@ from powderdsl.simulation.simulator import Simulator, World, compile
 from powderdsl.syntax.yaml_tree import Mapping as YamlMapping
 from powderdsl.syntax.yaml_tree import Sequence as YamlSequence
 from powderdsl.syntax.yaml_tree import parse_yaml
-from powderdsl.system.fingerprint import fingerprint
 from powderdsl.system.interrupts import delay_signal
+from powderdsl.system.settings import fingerprint
 from powderdsl.system.writing import write_text
 from powderdsl.testing.generators.cases import Array, Start
 from powderdsl.testing.mutation.operators import Mutant, mutants_of
