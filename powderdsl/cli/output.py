@@ -33,9 +33,8 @@ def write_diagnostics(diagnostics: Iterable[Diagnostic], stream: IO[str]) -> Non
     from powderdsl.diagnostics.diagnostic import render_text
 
     color = color_wanted(stream)
-    write_styled(
-        stream, "\n\n".join(render_text(diagnostic, color=color) for diagnostic in diagnostics) + "\n"
-    )
+    texts = (render_text(diagnostic, color=color) for diagnostic in diagnostics)
+    write_styled(stream, "\n\n".join(texts) + "\n")
 
 
 def print_json(value: Any) -> None:
@@ -82,7 +81,15 @@ def progress(
 @contextmanager
 def _bar(title: str, total: float, lines: bool, rounds: int) -> Iterator[Show]:
     if not sys.stderr.isatty() or os.environ.get("TERM") == "dumb":
-        yield _lines(total) if lines else lambda done, words="": None
+        last = time.monotonic()
+
+        def show_line(done: float, words: str = "") -> None:
+            nonlocal last
+            if lines and time.monotonic() - last > SECONDS:
+                last = time.monotonic()
+                click.echo(f"{done:,.0f} of {total:,.0f}  {words}".rstrip(), err=True)
+
+        yield show_line
         return
     from rich.console import Console
     from rich.progress import (
@@ -133,15 +140,3 @@ class Remaining:
         if not self.pace:
             return "-:--:--"
         return str(timedelta(seconds=round(self.pace * (self.total - done))))
-
-
-def _lines(total: float) -> Show:
-    last = time.monotonic()
-
-    def show(done: float, words: str = "") -> None:
-        nonlocal last
-        if time.monotonic() - last > SECONDS:
-            last = time.monotonic()
-            click.echo(f"{done:,.0f} of {total:,.0f}  {words}".rstrip(), err=True)
-
-    return show

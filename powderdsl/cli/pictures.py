@@ -122,7 +122,11 @@ class LiveView:
         ids = to_numpy(ids)
         shown = {name: to_numpy(value) for name, value in (fields or {}).items()}
         if self.in_place:
-            step = self._thinning(*ids.shape)
+            size = shutil.get_terminal_size()
+            room = max((size.lines - 2) * (2 if self.color else 1), 1)
+            step = max(
+                -(-ids.shape[0] // room), -(-ids.shape[1] // max(size.columns, 1)), 1
+            )  # no line may wrap
             ids = ids[::step, ::step]
             shown = {name: value[..., ::step, ::step] for name, value in shown.items()}
         if self.color:
@@ -141,12 +145,6 @@ class LiveView:
         self._height = len(lines)
         self._due = max(self._due + self._frame_seconds, time.perf_counter())
         time.sleep(max(self._due - time.perf_counter(), 0))
-
-    def _thinning(self, height: int, width: int) -> int:
-        """The step between rows and columns that are shown, so that the frame fits: no line may wrap."""
-        columns, lines = shutil.get_terminal_size()
-        room = max((lines - 2) * (2 if self.color else 1), 1)
-        return max(-(-height // room), -(-width // max(columns, 1)), 1)
 
     def _write(self, text: str) -> None:
         self.stream.write(text)

@@ -74,7 +74,9 @@ def start_drawn(
         side = fitting(ruleset, DEFAULT_SIDE)
         return Start(strew(ruleset, size or (side, side), batch or 1, seed or 0), {})
     if name.lower().endswith(".npz"):
-        _refuse_options("a saved world has its own", size=size, batch=batch, seed=seed)
+        for option, value in {"size": size, "batch": batch, "seed": seed}.items():
+            if value is not None:
+                raise BadInput(f"--{option} does not go with this world: a saved world has its own")
         return None
     from powderdsl.worlds.store import drawn_world
 
@@ -82,9 +84,3 @@ def start_drawn(
         world = drawn_world(name, ruleset, size)
     check_cells(batch or 1, world.ids.shape)
     return Start(np.repeat(world.ids[None], batch or 1, axis=0), world.fields)
-
-
-def _refuse_options(reason: str, **options: object) -> None:
-    for option, value in options.items():
-        if value is not None:
-            raise BadInput(f"--{option} does not go with this world: {reason}")

@@ -184,7 +184,14 @@ def from_minari(dataset_id: str, folder: str | Path) -> Dataset:
         recorded = {row.number for row in manifest.shards}
         for number in range(recipe.shards):
             if number not in recorded:
-                manifest = add_shard(place, manifest, number, _shard(source, recipe, number))
+                parts: dict[str, list[Array]] = {name: [] for name in DTYPES}
+                for episode in recipe.episodes_of(number):
+                    with reporting_damage(
+                        f"episode_{episode}: {source.storage.data_path} cannot be imported"
+                    ):
+                        for name, value in _episode(source, episode, recipe).items():
+                            parts[name].append(value)
+                manifest = add_shard(place, manifest, number, parts)
     return Dataset.open(place)
 
 
@@ -211,16 +218,6 @@ def _exported_recipe(source: minari.MinariDataset) -> Recipe:
         )
     # Episodes may have been added since.
     return read_recipe(folder, exported["recipe"] | {"episodes": source.total_episodes})
-
-
-def _shard(source: minari.MinariDataset, recipe: Recipe, number: int) -> dict[str, list[Array]]:
-    """The arrays of a shard, in parts, all checked. Raises CompileError (PD630)."""
-    parts: dict[str, list[Array]] = {name: [] for name in DTYPES}
-    for episode in recipe.episodes_of(number):
-        with reporting_damage(f"episode_{episode}: {source.storage.data_path} cannot be imported"):
-            for name, value in _episode(source, episode, recipe).items():
-                parts[name].append(value)
-    return parts
 
 
 def _episode(source: minari.MinariDataset, number: int, recipe: Recipe) -> dict[str, Array]:

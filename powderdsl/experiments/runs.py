@@ -52,22 +52,6 @@ class Checkpoint:
     path: Path
 
 
-def _encoded(state: Any) -> bytes:
-    import torch
-    from safetensors.torch import save
-
-    tensors: dict[str, Tensor] = {}
-    text = json.dumps(_packed(state, tensors)).encode()
-    return save({**tensors, STATE: torch.frombuffer(bytearray(text), dtype=torch.uint8)})
-
-
-def _decoded(data: bytes) -> Any:
-    from safetensors.torch import load
-
-    tensors = load(data)
-    return parse_json(bytes(tensors[STATE].numpy()), hook=partial(_unpacked, tensors=tensors))
-
-
 def _packed(value: Any, tensors: dict[str, Tensor]) -> Any:
     """A state as JSON has it: what is neither a list nor a plain value becomes a pair of its kind and contents."""
     import torch
@@ -216,7 +200,13 @@ class RunFolder:
                 continue
             if _digest(data) == digest:
                 try:
-                    return Checkpoint(step, _decoded(data), path)
+                    from safetensors.torch import load
+
+                    tensors = load(data)
+                    state = parse_json(
+                        bytes(tensors[STATE].numpy()), hook=partial(_unpacked, tensors=tensors)
+                    )
+                    return Checkpoint(step, state, path)
                 except ModuleNotFoundError:  # no safetensors
                     raise
                 except Exception as error:  # a crafted file raises whatever it likes
@@ -236,7 +226,12 @@ class RunFolder:
 
         Raises CompileError (PD613) if the folder cannot be written to, or the disk is full.
         """
-        data = _encoded(state)
+        import torch
+        from safetensors.torch import save
+
+        tensors: dict[str, Tensor] = {}
+        text = json.dumps(_packed(state, tensors)).encode()
+        data = save({**tensors, STATE: torch.frombuffer(bytearray(text), dtype=torch.uint8)})
         path = self.path / "checkpoints" / f"{step:012d}-{_digest(data)}.safetensors"
         with writing(path):
             path.parent.mkdir(parents=True, exist_ok=True)
@@ -390,12 +385,10 @@ def _flat(config: Mapping[str, Any], within: str = "") -> dict[str, str]:
     """Each setting by its dotted name, as JSON."""
     settings: dict[str, str] = {}
     for name, value in config.items():
-        is_group = isinstance(value, Mapping) and value
-        settings |= (
-            _flat(value, f"{within}{name}.")
-            if is_group
-            else {within + name: json.dumps(value, ensure_ascii=False)}
-        )
+        if isinstance(value, Mapping) and value:
+            settings |= _flat(value, f"{within}{name}.")
+        else:
+            settings[within + name] = json.dumps(value, ensure_ascii=False)
     return settings
 
 

@@ -433,23 +433,21 @@ def _compare(gates: Gates, node: Node, a: Bits, b: Bits) -> Node:
         if side.op == "count" and side.type.lo >= 0:  # none or some: neighbors are joined, not counted
             some = {test(number) for number in range(1, side.type.hi + 1)}
             if len(some) == 1 and test(0) not in some:
-                joined = _any_neighbor(gates, side)
+                weights, wraps = side.attr
+                flag = gates.values[side.args[0]]
+                rows = [
+                    gates.shift(
+                        gates.any([gates.shift(flag, (0, dx), wraps) for dx, _ in pattern]), (dy, 0), wraps
+                    )
+                    for dy, pattern in kernel_rows(weights).items()
+                ]
+                joined = gates.any(rows)
                 return joined if True in some else gates.not_(joined)
         if side.type.bits <= 5:
             return gates.look_up(bits, side.type, test, FLAG)[0]
     if node.op == "eq":
         return gates.eq(a, b)
     return gates.lt(a, b) if node.op == "lt" else gates.not_(gates.lt(b, a))
-
-
-def _any_neighbor(gates: Gates, count: Node) -> Node:
-    weights, wraps = count.attr
-    flag = gates.values[count.args[0]]
-    rows = [
-        gates.shift(gates.any([gates.shift(flag, (0, dx), wraps) for dx, _ in pattern]), (dy, 0), wraps)
-        for dy, pattern in kernel_rows(weights).items()
-    ]
-    return gates.any(rows)
 
 
 def _count(gates: Gates, node: Node, flag: Node) -> Bits:

@@ -157,9 +157,11 @@ def _write(program: LevelProgram, path: Path, recipe: Recipe, report: Callable[[
     rows, side = recipe.count * recipe.rows, program.level.side
     terminals = np.zeros((recipe.count, recipe.rows), dtype=np.int32)
     terminals[:, -1] = 1
+    actions = (recipe.actions(program.level, numbers) for numbers in recipe.parts)
+    action_rows = (part.reshape(len(part), -1)[:, : recipe.rows].astype(np.int32) for part in actions)
     arrays: dict[str, Array | Parts | str] = {
         "observations": Parts("|u1", (rows, side, side, 6), _observations(program, parts, recipe, report)),
-        "actions": Parts("<i4", (rows,), _action_rows(program.level, recipe)),
+        "actions": Parts("<i4", (rows,), action_rows),
         "terminals": terminals.reshape(-1),
     }
     with replacing(path) as temporary, temporary.open("wb") as whole:
@@ -176,17 +178,9 @@ def _observations(
             raise failure("PD613", f"cannot write the data set: {parts} was changed meanwhile")
         actions = recipe.actions(program.level, numbers)
         for at in range(0, len(numbers), WRITTEN):
-            observations = rows_of(
-                program, frames[at : at + WRITTEN], actions[at : at + WRITTEN], recipe.rows
-            )
-            yield observations
-            report((1 - PLAYED) * len(observations))
-
-
-def _action_rows(level: Level, recipe: Recipe) -> Iterator[NDArray[np.int32]]:
-    for numbers in recipe.parts:
-        actions = recipe.actions(level, numbers)
-        yield actions.reshape(len(actions), -1)[:, : recipe.rows].astype(np.int32)
+            few = slice(at, at + WRITTEN)
+            yield rows_of(program, frames[few], actions[few], recipe.rows)
+            report((1 - PLAYED) * len(numbers[few]))
 
 
 def _played(program: LevelProgram, recipe: Recipe, numbers: Numbers) -> Frames:

@@ -67,8 +67,13 @@ class EnvOptions:
         """The program of a level; environments of one process share it."""
         if isinstance(level, LevelProgram):
             return level
-        as_ogbench = self.randomness == "ogbench"
-        return _program(find_level(level), as_ogbench, self.backend, str(self.device), self.threads)
+        return _program(
+            find_level(level),
+            backend=self.backend,
+            device=str(self.device),
+            threads=self.threads,
+            as_ogbench=self.randomness == "ogbench",
+        )
 
     def picture(self, observation: Array) -> Array:
         """The world's part of an observation, by its nearest pixels: uint8 [height, width, 3]."""
@@ -77,9 +82,7 @@ class EnvOptions:
         return np.ascontiguousarray(observation[rows][:, columns, :3])
 
 
-@lru_cache(maxsize=16)
-def _program(level: Level, as_ogbench: bool, backend: str, device: str, threads: int) -> LevelProgram:
-    return LevelProgram(level, backend=backend, device=device, threads=threads, as_ogbench=as_ogbench)
+_program = lru_cache(maxsize=16)(LevelProgram)
 
 
 class _Face:

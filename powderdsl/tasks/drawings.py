@@ -105,7 +105,14 @@ def read_items(node: yaml_tree.Node | None, reader: Reader, *, nested: bool = Fa
         elif not nested and len(item.entries) == 1 and item.entries[0][0].text.startswith("repeat"):
             items.append(_repeat(*item.entries[0], reader))
         elif not (nested and _is_let(item)):
-            _not_a_statement(item, reporter, nested)
+            word = next(iter(item.entries[0][0].text.split()), "") if item.entries else ""
+            if nested and word == "repeat":
+                fix = "repetitions do not stand in repetitions: multiply the counts"
+            elif word == "let":
+                fix = "`let:` stands at the top of the file, or in a repetition"
+            else:
+                fix = "say `48:end` for `48:`, or quote the statement; `repeat 0..5:` has a list below it"
+            not_a_statement(item, reporter, fix)
     return tuple(item for item in items if item is not None)
 
 
@@ -135,17 +142,6 @@ def read_lets(node: yaml_tree.Node | None, reader: Reader) -> list[tuple[Written
             reader.shape(value, "a number")
         lets.append((key, line_in(value, "operand", reader)))
     return lets
-
-
-def _not_a_statement(item: yaml_tree.Mapping, reporter: Reporter, nested: bool) -> None:
-    word = next(iter(item.entries[0][0].text.split()), "") if item.entries else ""
-    if nested and word == "repeat":
-        fix = "repetitions do not stand in repetitions: multiply the counts"
-    elif word == "let":
-        fix = "`let:` stands at the top of the file, or in a repetition"
-    else:
-        fix = "say `48:end` for `48:`, or quote the statement; `repeat 0..5:` has a list below it"
-    not_a_statement(item, reporter, fix)
 
 
 MAX_DRAWINGS = 4_096

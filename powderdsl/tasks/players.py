@@ -43,7 +43,13 @@ class ExpertPlayer:
     def __call__(self, episodes: Episodes) -> Tensor:
         """The actions of some episodes, int64 [B, 5]."""
         if self.expert.search:
-            return self._planned(episodes)
+            seeds, last = episodes.seed.tolist(), self.program.task.agent.actions - 1
+            new = [seed for seed in dict.fromkeys(seeds) if seed not in self._plans]
+            if new:
+                worlds = torch.tensor(new, device=episodes.seed.device)
+                self._plans |= zip(new, best_plans(self.program, worlds, self.expert.search), strict=True)
+            steps = zip(seeds, episodes.acted.tolist(), strict=True)
+            return torch.stack([self._plans[seed][min(step, last)] for seed, step in steps])
         now = self._meter.take(episodes.world, episodes.regions, episodes.targets, None)
         left = self.program.task.agent.actions - episodes.acted
         facts = Facts(self._numbers, now, now, now, {"taken": episodes.acted, "left": left})
@@ -61,16 +67,6 @@ class ExpertPlayer:
             actions[applies] = targets[applies]
             waiting &= ~applies
         return actions
-
-    def _planned(self, episodes: Episodes) -> Tensor:
-        """The actions of the plans for some episodes, int64 [B, 5]."""
-        seeds, last = episodes.seed.tolist(), self.program.task.agent.actions - 1
-        new = [seed for seed in dict.fromkeys(seeds) if seed not in self._plans]
-        if new:
-            worlds = torch.tensor(new, device=episodes.seed.device)
-            self._plans |= zip(new, best_plans(self.program, worlds, self.expert.search), strict=True)
-        steps = zip(seeds, episodes.acted.tolist(), strict=True)
-        return torch.stack([self._plans[seed][min(step, last)] for seed, step in steps])
 
     def _action(self, move: ExpertMove, episodes: Episodes) -> tuple[Tensor, Tensor]:
         """The action of a move in every episode, int64 [B, 5], and the number of cells that it counts, int64 [B]."""

@@ -201,7 +201,7 @@ def unseen_data(
 
 # Pictures
 
-RIGHT, WRONG = (235, 235, 235), (200, 30, 30)
+RIGHT, WRONG = np.array([(235, 235, 235), (200, 30, 30)], np.uint8)
 """Colors of cells that were predicted correctly, and of others."""
 
 
@@ -256,7 +256,5 @@ def sheet(strips: list[Strip], rules: Ruleset, *, factor: int = 2) -> NDArray[np
     pictures = []
     for strip in strips:
         pictures += [rgb(ids, colors) for ids in (strip.start, strip.truth, strip.predicted)]
-        pictures.append(
-            np.where(strip.wrong[..., None], *(np.array(color, dtype=np.uint8) for color in (WRONG, RIGHT)))
-        )
+        pictures.append(np.where(strip.wrong[..., None], WRONG, RIGHT))
     return contact_sheet([scale(picture, factor) for picture in pictures], columns=4, gap=4)

@@ -195,11 +195,9 @@ class CustomNetwork:
         expected = [2, encoder.slots, *size]
         with torch.random.fork_rng(devices=[]), _reporting_user_errors(self.name, "cannot be trained"):
             logits: Any = network(inputs)
-            shape = (
-                f"{list(logits.shape)} of {logits.dtype}"
-                if isinstance(logits, Tensor)
-                else type(logits).__name__
-            )
+            shape = type(logits).__name__
+            if isinstance(logits, Tensor):
+                shape = f"{list(logits.shape)} of {logits.dtype}"
             if not (shape.startswith(str(expected)) and logits.is_floating_point()):
                 channels = [2, encoder.channels, *size]
                 raise ValueError(f"it must give logits {expected}, found {shape}, for channels {channels}")
@@ -207,9 +205,8 @@ class CustomNetwork:
             if logits.requires_grad and weights:
                 F.cross_entropy(logits.float(), torch.zeros(2, *size, dtype=torch.int64)).backward()
             if all(weight.grad is None for weight in weights):
-                raise ValueError(
-                    "no gradient reaches a parameter: logits must depend on some that require one"
-                )
+                why = "no gradient reaches a parameter: logits must depend on some that require one"
+                raise ValueError(why)
 
 
 def custom_network(name: str) -> CustomNetwork:
@@ -221,17 +218,12 @@ def custom_network(name: str) -> CustomNetwork:
     if os.getcwd() not in sys.path:
         sys.path.append(os.getcwd())  # behind all others: nothing that is installed is replaced
     with _reporting_user_errors(name, "cannot be imported"):
-        if not is_network_name(name):
+        if name.count(":") != 1 or not all(map(str.isidentifier, name.replace(":", ".").split("."))):
             raise ValueError("write MODULE:CLASS, such as nets:Deep")
         make = pkgutil.resolve_name(name)
         if not callable(make):
             raise TypeError(f"it is not a class but {type(make).__name__}")
     return CustomNetwork(name, make)
-
-
-def is_network_name(text: str) -> bool:
-    """True if a text has the form ``package.module:Class``. Nothing is imported."""
-    return text.count(":") == 1 and all(part.isidentifier() for part in text.replace(":", ".").split("."))
 
 
 @contextmanager
@@ -288,12 +280,9 @@ def _grown(state: dict[str, Any], model: nn.Module) -> dict[str, Any]:
     """Weights in the shapes of a network that has more slots, first in each dimension."""
     for name, fresh in model.state_dict().items():
         old = state.get(name)
-        if (
-            isinstance(old, Tensor)
-            and old.ndim == fresh.ndim
-            and old.shape != fresh.shape
-            and all(a <= b for a, b in zip(old.shape, fresh.shape, strict=True))
-        ):
+        if not isinstance(old, Tensor) or old.ndim != fresh.ndim or old.shape == fresh.shape:
+            continue
+        if all(a <= b for a, b in zip(old.shape, fresh.shape, strict=True)):
             state[name] = fresh.clone()
             state[name][tuple(slice(size) for size in old.shape)] = old
     return state

@@ -330,12 +330,8 @@ class _Trainer:
                             helps=(f"choose a smaller learning rate than {config.learning_rate:g}",),
                         )
                     seconds = time.monotonic() - since
-                    speed = LOG_EVERY * config.batch / seconds
-                    values = {
-                        "loss/train": loss,
-                        "time/pairs_a_second": speed,
-                        "time/simulation": making / seconds,
-                    }
+                    values = {"loss/train": loss, "time/simulation": making / seconds}
+                    values["time/pairs_a_second"] = LOG_EVERY * config.batch / seconds
                     since, making = time.monotonic(), 0.0
                 every = self.validate_every
                 if every and (self.done % every == 0 or self.done == total):
@@ -380,9 +376,8 @@ class _Trainer:
 
     def save(self) -> None:
         model, optimizer = self.model.state_dict(), self.optimizer.state_dict()
-        self.run.save_checkpoint(
-            self.done, {"model": model, "optimizer": optimizer, "recent": [*self.recent]}
-        )
+        state = {"model": model, "optimizer": optimizer, "recent": [*self.recent]}
+        self.run.save_checkpoint(self.done, state)
 
 
 def network_missing(folder: Path, name: str) -> CompileError:
@@ -405,11 +400,10 @@ def palette_of(config: DataConfig, slots: int = 0) -> tuple[str | None, ...]:
     Packs that are left out have slots too, so those that come later need no others. `slots` is how many there are at
     least. Raises CompileError.
     """
-    names_by_slot = list(whole_palette(*load_task(config.task, knobs=config.knobs).rules))
-    names_by_slot += (
-        [name for name in whole_palette(config.rules) if name not in names_by_slot] if config.rules else []
-    )
-    return (*names_by_slot, *[None] * (slots - len(names_by_slot)))
+    names = list(whole_palette(*load_task(config.task, knobs=config.knobs).rules))
+    if config.rules:
+        names += [name for name in whole_palette(config.rules) if name not in names]
+    return (*names, *[None] * (slots - len(names)))
 
 
 def _palette_for(config: TrainConfig, folder: Path, worlds: Worlds | None) -> tuple[str | None, ...]:
@@ -500,9 +494,14 @@ def finetuned(
     config = trained.config
     if config.recorded is not None:
         raise misfit(trained.run.path, "it learned from a dataset, and other packs are not in it")
-    data = config.data
-    data = with_packs(data, data.rules or "+".join(load_task(data.task).rules), packs)
-    palette = extended_palette(trained.palette, load_rules_of(data, trained.palette))
+    own = config.data.rules or "+".join(load_task(config.data.task).rules)
+    data = with_packs(config.data, own, packs)
+    rules = load_rules_of(data, trained.palette)
+    ids = [element.id for element in rules.elements]
+    slots = [*trained.palette, *[None] * (max(ids) + 1 - len(trained.palette))]
+    for element in rules.elements:
+        slots[element.id] = element.qualified
+    palette = tuple(slots)
     values = {"iterations": iterations, "parent": trained.checkpoint.path.name, **changes}
     return replace(config, data=data, palette=palette, **values)
 
@@ -511,15 +510,6 @@ def with_packs(data: DataConfig, own: str, packs: Sequence[str]) -> DataConfig:
     """The worlds of `data` under its own rules with packs added, which alone are drawn. Raises CompileError as `load`."""
     knobs = {name: value for name, value in data.knobs.items() if name != SIMPLER}
     return replace(data, rules=add(own, packs), only=pack_names(own, packs), knobs=knobs, rulesets=0)
-
-
-def extended_palette(palette: Palette, rules: Ruleset) -> tuple[str | None, ...]:
-    """A palette with the elements of rules that were loaded with it: in its free slots, then behind its end."""
-    ids = [element.id for element in rules.elements]
-    slots = [*palette, *[None] * (max(ids) + 1 - len(palette))]
-    for element in rules.elements:
-        slots[element.id] = element.qualified
-    return tuple(slots)
 
 
 # Rules with packs added and left out

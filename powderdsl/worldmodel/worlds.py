@@ -47,7 +47,6 @@ from powderdsl.worldmodel.networks import NO_ELEMENT
 
 if TYPE_CHECKING:
     from powderdsl.datasets import Dataset, Transitions
-    from powderdsl.datasets.manifest import Recipe
 
 VALIDATION_SEEDS = 1 << 33
 """The first seed of worlds that models are validated on during training: far beyond those of tests."""
@@ -281,26 +280,19 @@ class _Narrowing:
         self.drawn = {
             element.id for element in own.elements if element.id in self.ids and element.pack in chosen
         }
-        self.added = tuple(
-            element.id
-            for element in rules.elements
-            if element.pack not in own.packs and element.pack in chosen
-        )
+        chosen -= {*own.packs}
+        self.added = tuple(element.id for element in rules.elements if element.pack in chosen)
         self.missing: list[str] = []
         self.span: Span | None = None
 
     def generator(self, generator: Generator) -> Generator:
         drawn = {drawing.stamp for group in generator.groups for drawing in group.drawings}
-        return replace(
-            generator,
-            fill=self.id(generator.fill),
-            groups=tuple(
-                replace(group, drawings=tuple(map(self.drawing, group.drawings)))
-                for group in generator.groups
-            ),
-            stamps=tuple(self.stamp(stamp) for stamp in generator.stamps if stamp.name in drawn),
-            targets=(),
-        )
+        fill = self.id(generator.fill)
+        groups = [
+            replace(group, drawings=tuple(map(self.drawing, group.drawings))) for group in generator.groups
+        ]
+        stamps = tuple(self.stamp(stamp) for stamp in generator.stamps if stamp.name in drawn)
+        return replace(generator, fill=fill, groups=tuple(groups), stamps=stamps, targets=())
 
     def drawing(self, drawing: Drawing) -> Drawing:
         if len(drawing.ids) > 1:
@@ -367,10 +359,9 @@ class Recording:
         try:
             self.parts: tuple[Transitions, ...] = split(self.all, PARTS)
         except ValueError as error:
-            fix, why = "record episodes of more worlds: a hundred are enough", str(error)
-            raise failure(
-                "PD631", f"{dataset.folder} has too few worlds", notes=(why,), helps=(fix,)
-            ) from None
+            helps = ("record episodes of more worlds: a hundred are enough",)
+            message = f"{dataset.folder} has too few worlds"
+            raise failure("PD631", message, notes=(str(error),), helps=helps) from None
 
     @cached_property
     def recorded(self) -> Recorded:
@@ -429,9 +420,8 @@ class Recording:
         """A batch of the training worlds' transitions, all equally likely, which seed and iteration decide."""
         from powderdsl.datasets.dataset import drawn
 
-        numbers = self.training
-        chosen = torch.from_numpy(drawn(seed % (1 << 62), iteration, count, len(numbers)))
-        return self.pairs(self.parts[0], numbers[chosen], device)
+        chosen = torch.from_numpy(drawn(seed % (1 << 62), iteration, count, len(self.training)))
+        return self.pairs(self.parts[0], self.training[chosen], device)
 
     @cached_property
     def training(self) -> Tensor:
@@ -459,20 +449,14 @@ def open_recording(folder: str | Path, task: str | None = None) -> Recording:
     palette = tuple(ids.get(number) for number in range(max(ids) + 1))
     params = changed_params(recipe, load_task(name))
     played = load_task(name, knobs=recipe.knobs, params=params, palette=palette)
-    notes = _differences(recipe, played)
+    there = {"size": recipe.shape[1:], "actions": recipe.action_nvec, "choices": recipe.choices}
+    here = {"size": played.size, "actions": played.agent.action_nvec, "choices": choice_names(played)}
+    notes = differences(there, here)
+    if not notes and recipe.task_fingerprint != fingerprint(played):
+        notes = ("the task, its knobs or its rules have changed since, or it had more packs",)
     if notes:
         raise failure("PD631", f"{folder} does not fit the task {played.name}", notes=notes)
     return Recording(dataset, name, played, palette)
-
-
-def _differences(recipe: Recipe, task: Task) -> tuple[str, ...]:
-    """The differences between a recipe and a task, none if the task was recorded with it."""
-    there = {"size": recipe.shape[1:], "actions": recipe.action_nvec, "choices": recipe.choices}
-    here = {"size": task.size, "actions": task.agent.action_nvec, "choices": choice_names(task)}
-    if changes := differences(there, here):
-        return changes
-    same = recipe.task_fingerprint == fingerprint(task)
-    return () if same else ("the task, its knobs or its rules have changed since, or it had more packs",)
 
 
 TRIES = 8
@@ -557,9 +541,7 @@ class RulesetSource:
         reporter = Reporter()
         model = check(list(packs), self.ruleset_decl, reporter, self.palette)
         left_out = {pack.name.text for pack in self.packs} - {pack.name.text for pack in packs}
-        params = {
-            name: value for name, value in self.params.items() if name.partition(".")[0] not in left_out
-        }
+        params = {name: self.params[name] for name in self.params if name.partition(".")[0] not in left_out}
         model = set_params(model, params, reporter) if params else model
         reporter.raise_if_errors()
         return model

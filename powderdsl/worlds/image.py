@@ -7,7 +7,6 @@ import warnings
 import zlib
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, BinaryIO
 
 from powderdsl.arrays import NDArray, np
 from powderdsl.diagnostics import CompileError, Diagnostic, Label
@@ -83,7 +82,16 @@ def _pixels(path: Path) -> NDArray[np.uint8]:
         raise failure("PD101", f"cannot read {path}", notes=(error.strerror or str(error),)) from None
     with file:
         try:
-            return _decode(file, path, images)
+            with warnings.catch_warnings():
+                warnings.simplefilter("error", images.DecompressionBombWarning)
+                image = images.open(file, formats=["PNG"])  # reads only the header
+            width, height = image.size
+            if height * width > MAX_CELLS:
+                raise _too_large(path, f"{height}×{width}")
+            if image.mode not in _MODES:
+                note = f"pixel format {image.mode}; save it with 8 bits a channel"
+                raise failure("PD602", f"{path} is not a picture of a world", notes=(note,))
+            return np.array(image.convert("RGBA"))
         except (images.DecompressionBombWarning, images.DecompressionBombError):
             raise _too_large(path, "far too many") from None
         except _BROKEN as error:
@@ -92,19 +100,6 @@ def _pixels(path: Path) -> NDArray[np.uint8]:
 
 _BROKEN = (OSError, ValueError, SyntaxError, EOFError, IndexError, OverflowError, MemoryError, zlib.error)
 """Errors that Pillow raises for broken files."""
-
-
-def _decode(file: BinaryIO, path: Path, images: Any) -> NDArray[np.uint8]:
-    with warnings.catch_warnings():
-        warnings.simplefilter("error", images.DecompressionBombWarning)
-        image = images.open(file, formats=["PNG"])  # reads only the header
-    width, height = image.size
-    if height * width > MAX_CELLS:
-        raise _too_large(path, f"{height}×{width}")
-    if image.mode not in _MODES:
-        note = f"pixel format {image.mode}; save it with 8 bits a channel"
-        raise failure("PD602", f"{path} is not a picture of a world", notes=(note,))
-    return np.array(image.convert("RGBA"))
 
 
 def _too_large(path: Path, size: str) -> CompileError:

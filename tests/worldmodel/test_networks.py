@@ -11,9 +11,10 @@ from pathlib import Path
 import pytest
 import torch
 
+from powderdsl.diagnostics import CompileError
 from powderdsl.experiments.runs import read_metrics
 from powderdsl.worldmodel import TrainConfig, custom_network, load_trained, train
-from powderdsl.worldmodel.networks import ActionChannels, CustomNetwork, is_network_name
+from powderdsl.worldmodel.networks import ActionChannels, CustomNetwork
 from powderdsl.worldmodel.training import TrainingProgress
 from tests.cli.commands import powderdsl as run
 from tests.refusals import refusal, refused_codes
@@ -218,10 +219,10 @@ def test_a_run_of_the_u_net_has_no_name_and_hostile_names_are_text(dunes: str) -
 
 
 def test_names_of_networks() -> None:
-    assert is_network_name("nets:Wide")
-    assert is_network_name("some.nets:Outer.Inner")
     for wrong in ("nets", "nets:", ":Wide", "a:b:c", "a b:c", "a:b()", "../a:b", ""):
-        assert not is_network_name(wrong)
+        with pytest.raises(CompileError) as error:
+            custom_network(wrong)
+        assert "write MODULE:CLASS" in error.value.diagnostics[0].notes[0]
 
 
 def test_what_is_installed_comes_before_the_current_folder() -> None:

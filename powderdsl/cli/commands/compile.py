@@ -42,7 +42,14 @@ def command(
     if after is not None and stage != "schedule":
         raise BadInput("--after goes with --emit schedule")
     if stage == "tree":
-        text = _tree(rules, pass_name)
+        reporter = Reporter()
+        packs, _ = read([rules], reporter)
+        reporter.raise_if_errors()
+        if pass_name is not None:
+            _check_known(
+                "pass", pass_name, [decl.name.text for pack in packs for decl in pack.passes], "passes"
+            )
+        text = print_tree(packs, pass_name)
     else:
         text = _checked(opt.load_rules(rules, settings), stage, backend, after, pass_name)
     click.echo(text, nl=not text.endswith("\n"))
@@ -91,11 +98,8 @@ def _schedules(
                 yield print_schedule(dict(steps(part.planes, pass_, stages))[last])
 
 
-SHOWN_SHARED = 227 << 10
-"""Bytes of shared memory of the GPU for which kernels are shown, on a grid of 64 × 64."""
-
-SHOWN_WIDTH = 64
-"""Columns of the grid for which WebAssembly is shown."""
+SHOWN_WIDTH, SHOWN_SHARED = 64, 227 << 10
+"""Columns of the grid, and bytes of shared memory of the GPU, for which kernels are shown."""
 
 
 def _kernels(program: Program, backend: str, pass_name: str | None) -> Iterator[str]:
@@ -124,7 +128,7 @@ def _kernels(program: Program, backend: str, pass_name: str | None) -> Iterator[
         elif backend == "cuda":
             from powderdsl.targets.cuda.source import cuda_source
 
-            yield cuda_source(part.planes, 64, 64, SHOWN_SHARED).text
+            yield cuda_source(part.planes, SHOWN_WIDTH, SHOWN_WIDTH, SHOWN_SHARED).text
         else:
             from powderdsl.targets.wasm.source import pass_function_name, wasm_module
 
@@ -135,13 +139,3 @@ def _kernels(program: Program, backend: str, pass_name: str | None) -> Iterator[
 def _check_known(what: str, name: str, known: Sequence[str], plural: str) -> None:
     if name not in known:
         raise BadInput(with_suggestion(f"no {what} `{name}`", name, known, plural))
-
-
-def _tree(rules: str, pass_name: str | None) -> str:
-    """The packs as parsed, before they are checked, as text."""
-    reporter = Reporter()
-    packs, _ = read([rules], reporter)
-    reporter.raise_if_errors()
-    if pass_name is not None:
-        _check_known("pass", pass_name, [decl.name.text for pack in packs for decl in pack.passes], "passes")
-    return print_tree(packs, pass_name)

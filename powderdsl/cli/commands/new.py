@@ -40,20 +40,15 @@ def command(name: str, folder: Path) -> None:
     color = colorsys.hsv_to_rgb(name_number(name) / 2**32, 0.55, 0.85)
     digits = "".join(f"{round(part * 255):02X}" for part in color)
     text = Template(TEMPLATE.read_text(encoding="utf-8")).substitute(name=name, color=f"#{digits}")
-    for problem in _problems(name, text):
-        raise BadInput(f"`{name}` cannot name a pack: {problem}")
-    write_text(path, text)
-    click.echo(f"wrote {path}: powderdsl run {path} --watch")
-
-
-def _problems(name: str, text: str) -> list[str]:
-    """Errors in the new pack: its name means something in the language or in the pack that it needs."""
+    # The name may mean something in the language, or in the pack that the new one needs.
     reporter = Reporter()
     packs, _ = read(["core"], reporter)
     new = read_file(Source(f"{name}.yaml", text), reporter)
     if isinstance(new, PackDecl):
         with suppress(CompileError):
             check([*packs, new], None, reporter)
-    return [
-        diagnostic.message for diagnostic in reporter.diagnostics if diagnostic.severity is Severity.ERROR
-    ]
+    for diagnostic in reporter.diagnostics:
+        if diagnostic.severity is Severity.ERROR:
+            raise BadInput(f"`{name}` cannot name a pack: {diagnostic.message}")
+    write_text(path, text)
+    click.echo(f"wrote {path}: powderdsl run {path} --watch")

@@ -94,10 +94,8 @@ def command(
     count, height, width = last.shape
     head = f"{ruleset.name}: {counted(count, 'world')} of {height}×{width}, {plan.steps} steps in {seconds:.2f} s"
     if verbose:
-        rate = count * height * width * plan.steps / max(seconds, 1e-9)
-        head += (
-            f" ({rate:,.0f} cells/s; {last.sim.running} on {last.sim.device}, {counted(threads, 'thread')})"
-        )
+        rate, where = count * height * width * plan.steps / max(seconds, 1e-9), last.sim.device
+        head += f" ({rate:,.0f} cells/s; {last.sim.running} on {where}, {counted(threads, 'thread')})"
     click.echo(head + (f" -> {plan.out}" if plan.out else ""), err=True)
     if verbose:
         for note in last.sim.notes:

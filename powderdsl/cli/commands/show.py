@@ -16,7 +16,6 @@ from powderdsl.analysis.changes import reactions
 from powderdsl.cli import options as opt
 from powderdsl.cli.exits import BadInput
 from powderdsl.cli.output import color_wanted, print_json
-from powderdsl.diagnostics import Span
 from powderdsl.diagnostics.printable import printable, write_styled
 from powderdsl.model.text import element_name, one_line, place_of, show_set, show_value
 from powderdsl.model.types import ColorRamp, Element, Pass, Property, Ruleset
@@ -92,14 +91,17 @@ def _show(head: dict[str, Any], tables: Tables, as_json: bool) -> None:
     lines = [printable(f"{head['name']}{about}")]
     lines += [f"{name}: {_text(value)}" for name, value in head.items() if name not in ("name", "about")]
     for name, parts in tables.items():
-        rows = [dict(_columns(part)) for part in parts]
+        rows = [
+            {
+                key: cell
+                for name, value in part.items()
+                for key, cell in (value.items() if isinstance(value, dict) else ((name, value),))
+            }
+            for part in parts
+        ]
         cells = [[_text(cell, styled) for cell in row.values()] for row in rows]
         columns = [column for column in zip(rows[0], *cells, strict=True) if any(column[1:])] if rows else []
-        lines += [
-            "",
-            TITLES.get(name, name.capitalize()),
-            *table([list(row) for row in zip(*columns, strict=True)]),
-        ]
+        lines += ["", TITLES.get(name, name.capitalize()), *table([*zip(*columns, strict=True)])]
     write_styled(sys.stdout, "\n".join(lines) + "\n")
 
 
@@ -110,11 +112,6 @@ def _data(value: Any) -> Any:
     if isinstance(value, dict):
         return {name: _data(part) for name, part in value.items()}
     return [_data(part) for part in value] if isinstance(value, list) else value
-
-
-def _columns(row: dict[str, Any]) -> Iterator[tuple[str, Any]]:
-    for name, value in row.items():
-        yield from value.items() if isinstance(value, dict) else ((name, value),)
 
 
 def _text(value: Any, styled: bool = False) -> str:
@@ -133,11 +130,6 @@ COLOR = re.compile("#([0-9A-Fa-f]{6})")
 def _swatch(color: re.Match[str]) -> str:
     red, green, blue = bytes.fromhex(color[1])
     return f"\x1b[48;2;{red};{green};{blue}m    \x1b[0m {color[0]}"
-
-
-def rule_spans(pass_: Pass) -> tuple[Span, ...]:
-    """The spans of the rules of a pass, each line once: loops and symmetries make many rules of one."""
-    return tuple(dict.fromkeys(rule.span for moment in pass_.moments for rule in moment.rules))
 
 
 def _of_rules(ruleset: Ruleset) -> tuple[dict[str, Any], Tables]:
@@ -206,8 +198,8 @@ def _elements(ruleset: Ruleset, ids: Iterable[int]) -> Shown:
 
 
 def _rules(pass_: Pass) -> Shown:
-    """The number of a pass's rules, and their lines."""
-    spans = rule_spans(pass_)
+    """The number of a pass's rules, and their lines, each once: loops and symmetries make many rules of one."""
+    spans = dict.fromkeys(rule.span for moment in pass_.moments for rule in moment.rules)
     return Shown(str(len(spans)), [{"rule": one_line(span), "where": place_of(span)} for span in spans])
 
 

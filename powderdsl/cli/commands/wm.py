@@ -113,9 +113,8 @@ def train_command(folder: Path | None, ignore_actions: bool, **values: Any) -> N
     recording = open_recording(values["data"], values["task"])
     recorded = replace(recording.recorded, actions=not ignore_actions)
     with user_values():
-        config = replace(
-            PRESETS[values["preset"]], recorded=recorded, **opt.given_settings(values, TrainConfig)
-        )
+        given = opt.given_settings(values, TrainConfig)
+        config = replace(PRESETS[values["preset"]], recorded=recorded, **given)
     name = f"{recording.task.name}-blind" if ignore_actions else recording.task.name
     _run(config, folder or Path("runs") / name, values, recording=recording)
 
@@ -229,10 +228,8 @@ def show_command(run: str, out: Path, scale: int, **values: Any) -> None:
     if steps % step:
         raise BadInput(f"--steps {steps}: this network predicts {step} steps, or several times as many")
     worlds = unseen_worlds(trained, machine=machine, **tested_on(values))
-    after = values["after"] or 0
-    _show(
-        strips(trained.network, worlds, step=step, times=steps // step, after=after), worlds.rules, out, scale
-    )
+    tests = strips(trained.network, worlds, step=step, times=steps // step, after=values["after"] or 0)
+    _show(tests, worlds.rules, out, scale)
     for variant in worlds.missing:
         click.echo(f"left out: {variant.name}, which needs {', '.join(variant.elements)}", err=True)
 
@@ -329,10 +326,8 @@ def _run(config: TrainConfig, folder: Path, values: dict[str, Any], **more: Any)
             validate_every=values["validate_every"],
             **more,
         )
-    seconds = time.monotonic() - began
-    click.echo(
-        f"{run.path}: {config.iterations:,} iterations, {seconds:.0f} s here; powderdsl wm eval {run.path}"
-    )
+    spent = f"{config.iterations:,} iterations, {time.monotonic() - began:.0f} s here"
+    click.echo(f"{run.path}: {spent}; powderdsl wm eval {run.path}")
 
 
 # Reports

@@ -75,9 +75,8 @@ def findings(study: Study, outcomes: Sequence[Outcome]) -> list[Finding]:
     for measure in study.measures:
         by_values: dict[tuple[tuple[str, str], ...], dict[int, float]] = {}
         for outcome in finished:
-            by_values.setdefault(outcome.point.values, {})[outcome.point.seed] = outcome.values[
-                measure.name.text
-            ]
+            by_seed, value = by_values.setdefault(outcome.point.values, {}), outcome.values[measure.name.text]
+            by_seed[outcome.point.seed] = value
         cells = tuple(
             Cell(dict(values), by_seed, interval([*by_seed.values()], measure.scale))
             for values, by_seed in by_values.items()

@@ -28,6 +28,9 @@ from powderdsl.targets.tensor_kind import WORD, word_count
 class Portable:
     """The operations on words and cells of worlds of one size."""
 
+    axes = (0, 1)
+    """Of the rows and columns of cells."""
+
     def __init__(self, batch: int, height: int, width: int, device: torch.device):
         self.batch, self.height, self.width, self.device = batch, height, width, device
         self.across = word_count(width)
@@ -68,23 +71,17 @@ class Portable:
             plane = plane & self.valid
         by = dx % self.width
         if self.across > 1 or not by:
-            return self._right(plane, by) | self._left(plane, self.width - by)
+            return self._right(plane, by) | self._right(plane, by - self.width)
         right = (plane >> by).bitwise_and_((1 << (WORD - by)) - 1)
         return right.bitwise_or_(plane << (self.width - by))
 
     def _right(self, plane: Tensor, by: int) -> Tensor:
+        """The flags `by` columns to the right, and zeros."""
         words, bits = divmod(by, WORD)
-        plane = self._words(plane, words)
         if not bits:
-            return plane
-        return ((plane >> bits) & ((1 << (WORD - bits)) - 1)) | (self._words(plane, 1) << (WORD - bits))
-
-    def _left(self, plane: Tensor, by: int) -> Tensor:
-        words, bits = divmod(by, WORD)
-        plane = self._words(plane, -words)
-        if not bits:
-            return plane
-        return (plane << bits) | ((self._words(plane, -1) >> (WORD - bits)) & ((1 << bits) - 1))
+            return self._words(plane, words)
+        low = (self._words(plane, words) >> bits) & ((1 << (WORD - bits)) - 1)
+        return low | (self._words(plane, words + 1) << (WORD - bits))
 
     def _words(self, plane: Tensor, by: int) -> Tensor:
         """The words `by` places further in each row, and zeros."""
@@ -166,9 +163,8 @@ class Portable:
     def _numbers(self, bits: int, halves: slice) -> Tensor:
         """What enters the hash for each bit and some halves of words: int32 [bits, H, 1, halves]."""
         count = -(-self.width // 32)  # the last word may lack a half
-        half = torch.arange(2 * self.across, dtype=torch.int32, device=self.device)[halves].clamp(
-            max=count - 1
-        )
+        half = torch.arange(2 * self.across, dtype=torch.int32, device=self.device)[halves]
+        half = half.clamp(max=count - 1)
         row = torch.arange(self.height, dtype=torch.int32, device=self.device)[:, None, None] * count
         plane = torch.arange(bits, dtype=torch.int32, device=self.device)[:, None, None, None]
         return ((row + half) * 32 + plane) * (0x9E3779B1 - (1 << 32))
@@ -256,10 +252,7 @@ class Portable:
 
     def neighbor(self, value: Tensor | float, dy: int, dx: int) -> Tensor:
         """The float at a neighbor; the grid wraps."""
-        return self._roll(self.all_cells(value), dy, dx)
-
-    def _roll(self, cells: Tensor, dy: int, dx: int) -> Tensor:
-        return torch.roll(cells, (-dy, -dx), (0, 1))
+        return torch.roll(self.all_cells(value), (-dy, -dx), self.axes)
 
     def choose(self, mask: Tensor, yes: Tensor | float, no: Tensor | float) -> Tensor:
         """One float where a mask holds, the other elsewhere."""
@@ -316,6 +309,8 @@ def _pattern(value: float) -> int:
 class Eager(Portable):
     """The operations for CPUs, which are little endian."""
 
+    axes = (0, 2)
+
     def replaced(self, words: Tensor, numbers: Sequence[int], planes: Sequence[Tensor]) -> Tensor:
         words = words.clone()
         for i, plane in zip(numbers, planes, strict=True):
@@ -371,9 +366,6 @@ class Eager(Portable):
     def all_cells(self, value: Tensor | float) -> Tensor:
         return self.tensor(value).expand(self.height, self.batch, self.width).contiguous()
 
-    def _roll(self, cells: Tensor, dy: int, dx: int) -> Tensor:
-        return torch.roll(cells, (-dy, -dx), (0, 2))
-
     def choose(self, mask: Tensor, yes: Tensor | float, no: Tensor | float) -> Tensor:
         if isinstance(no, float):
             if isinstance(yes, float):
@@ -406,10 +398,8 @@ class Eager(Portable):
     def _framed(self, dy: int, dx: int) -> tuple[Tensor, Tensor, list[tuple[Tensor, Tensor]]]:
         """Memory for a float of each cell, the part of it at a neighbor, and what must be copied around the edges."""
         if ("framed", dy, dx) not in self.fixed:
-            (height, ys, to_y, edge_y), (width, xs, to_x, edge_x) = (
-                _frame(dy, self.height),
-                _frame(dx, self.width),
-            )
+            height, ys, to_y, edge_y = _frame(dy, self.height)
+            width, xs, to_x, edge_x = _frame(dx, self.width)
             frame = torch.empty(height, self.batch, width)
             borders = [(frame[ys, :, border], frame[ys, :, cells]) for border, cells in edge_x]
             borders += [(frame[border], frame[cells]) for border, cells in edge_y]
@@ -419,9 +409,8 @@ class Eager(Portable):
 
     def square_root(self, value: Tensor) -> Tensor:
         with np.errstate(invalid="ignore"):
-            return torch.from_numpy(
-                np.sqrt(value.numpy())
-            )  # rounded correctly, as torch does only for float64
+            # Rounded correctly, as torch does only for float64.
+            return torch.from_numpy(np.sqrt(value.numpy()))
 
     def settle(self, value: Tensor, low: float, high: float) -> Tensor:
         value = value.clamp(low, high).nan_to_num_(nan=0.0, posinf=high, neginf=low)

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from threading import get_ident
 from types import FunctionType
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -46,8 +45,7 @@ class PlanesState(PackedArrays):
         return torch.cat([self.program.unpack(chunk, name, self.like) for chunk in self.chunks])
 
 
-@dataclass
-class _Kernels:
+class _Kernels(NamedTuple):
     """The operations for one size, and the functions of the passes."""
 
     k: Portable
@@ -98,10 +96,8 @@ class PlanesProgram:
                     chunk = job.state.chunks[number]
                 else:
                     chunk = self.pack(kernels.k, {name: array[part] for name, array in job.state.items()})
-                seed, index, step = job.clock.seed[part], job.clock.world[part], job.clock.step[part]
-                chunks.append(
-                    self._steps(kernels, chunk, job, base_keys(seed, index), step, settings[1][number])
-                )
+                base, step = base_keys(job.clock.seed[part], job.clock.world[part]), job.clock.step[part]
+                chunks.append(self._steps(kernels, chunk, job, base, step, settings[1][number]))
         return PlanesState(self, chunks, like)
 
     def _function(self, source: Source) -> Callable[..., Batch]:
@@ -128,10 +124,12 @@ class PlanesProgram:
         self, kernels: _Kernels, chunk: Batch, job: Job, base: Tensor, start: Tensor, settings: dict[Key, Any]
     ) -> Batch:
         k, (words, fields) = kernels.k, chunk
-        fixed = {key: self._fixed(k, key) for key in self._keys(*FIXED)} | settings
+        for key in self._keys(*FIXED):
+            if key not in k.fixed:
+                k.fixed[key] = getattr(k, key[0])(*key[1:])
         for i in range(job.steps):
             step = start + i
-            values = dict(fixed)
+            values = k.fixed | settings
             bits = tuple(self._bits.values())
             drawn = kernels.draw(k, base, step, self._idents, bits) if bits else ()
             for stream, planes in zip(self._bits, drawn, strict=True):
@@ -140,9 +138,8 @@ class PlanesProgram:
                 values[key] = -(step % key[1] >> key[2] & 1)[:, None]
             words, fields = self._reset(k, words, fields)
             job.tick("")
-            for pass_, source, function in zip(
-                self.planes.passes, self._sources, kernels.functions, strict=True
-            ):
+            passes = zip(self.planes.passes, self._sources, kernels.functions, strict=True)
+            for pass_, source, function in passes:
                 words, fields = function(k, words, fields, tuple([values[key] for key in source.inputs]))
                 job.tick(pass_.name)
         return words, fields
@@ -151,12 +148,6 @@ class PlanesProgram:
         return [key for source in self._sources for key in source.inputs if key[0] in kinds]
 
     # Inputs of passes
-
-    def _fixed(self, k: Portable, key: Key) -> Any:
-        """What depends on the grid only."""
-        if key not in k.fixed:
-            k.fixed[key] = getattr(k, key[0])(*key[1:])
-        return k.fixed[key]
 
     def _parameters(self, params: Mapping[str, Tensor], part: slice) -> dict[Key, Any]:
         """What depends on parameters. Limits that all worlds share are numbers where that costs no sync."""
@@ -220,10 +211,8 @@ class PlanesProgram:
             weights = [1 << i for i in range(len(bits))]
             if piece.signed:
                 weights[-1] = -weights[-1]
-            total = (
-                bits * torch.tensor(weights, dtype=torch.int32, device=bits.device).view(-1, 1, 1, 1)
-            ).sum(0)
-            parts.append(k.from_cells(total))
+            factors = torch.tensor(weights, dtype=torch.int32, device=bits.device).view(-1, 1, 1, 1)
+            parts.append(k.from_cells((bits * factors).sum(0)))
         whole = parts[0] if self._pieces[name][0].component is None else torch.stack(parts, 1)
         return whole.to(dtype).contiguous()
 

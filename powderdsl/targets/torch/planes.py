@@ -240,9 +240,8 @@ class _Writer:
             case _:
                 text, args = self.real(node) if is_real else self.flag(node)
                 value = self.values[node] = self.name(text, "f" if is_real else "n", args, node.op)
-                whole = node.op in ("shift", "eq", "lt", "le", "draw") or text.startswith(
-                    ("k.choose", "k.increase")
-                )
+                whole = node.op in ("shift", "eq", "lt", "le", "draw")
+                whole |= text.startswith(("k.choose", "k.increase"))
                 if whole or not self.full.isdisjoint(args):
                     self.full.add(value)
 
@@ -261,14 +260,15 @@ class _Writer:
                 return f"k.below({draws}, {self.input('limit', *key)})", []
             args = [*map(self.of, node.args)]
             return f"k.below({draws}, ({', '.join(args)},))", args
-        if node.op == "param":
-            return self.input("bit", *param_key(node)), []
-        if node.op == "coordinate":
-            return self.input(*node.attr), []
-        if node.op == "inside":
-            return self.input("inside", *node.attr), []
-        if node.op == "shift":
-            return self.shift(self.of(node.args[0]), *node.attr)
+        match node.op:
+            case "param":
+                return self.input("bit", *param_key(node)), []
+            case "coordinate":
+                return self.input(*node.attr), []
+            case "inside":
+                return self.input("inside", *node.attr), []
+            case "shift":
+                return self.shift(self.of(node.args[0]), *node.attr)
         args = [*map(self.of, node.args)]
         if node.op in _COMPARED and node.args[0].type == REAL:
             return f"k.compare({node.op!r}, {args[0]}, {args[1]})", args

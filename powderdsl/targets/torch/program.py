@@ -135,10 +135,9 @@ class Kernels:
         """A stream's draws as integers, int64 [B, H, W]."""
         if stream not in self._draws:
             position, bits = self.streams[stream]
-            given = self.replacements.get(stream)
-            self._draws[stream] = (
-                draws(self.keys[position], bits, *self.shape[1:]) if given is None else given
-            )
+            if (drawn := self.replacements.get(stream)) is None:
+                drawn = draws(self.keys[position], bits, *self.shape[1:])
+            self._draws[stream] = drawn
         return self._draws[stream]
 
     def draw_real(self, stream: str) -> Tensor:
@@ -180,12 +179,9 @@ class TorchProgram:
         self.device = device
         self._pieces = pieces(program)
         self._streams = {name: (i, bits) for i, (name, _, bits) in enumerate(program.streams)}
-        self._idents = torch.tensor(
-            [ident for _, ident, _ in program.streams], dtype=torch.int64, device=device
-        )
-        self._functions: list[tuple[str, PassFunction]] = [
-            (p.name, compiled(*pass_source(p, i), device)) for i, p in enumerate(program.passes)
-        ]
+        idents = [ident for _, ident, _ in program.streams]
+        self._idents = torch.tensor(idents, dtype=torch.int64, device=device)
+        self._functions = [compiled(*pass_source(p, i), device) for i, p in enumerate(program.passes)]
 
     def run(self, job: Job) -> Mapping[str, Tensor]:
         """The state `job.steps` later in storage dtypes; no host sync."""
@@ -205,14 +201,15 @@ class TorchProgram:
                 kernels.begin(start + i)
                 for slot in self.program.slots:
                     if slot.resets:
+                        dtype = DTYPES[slot.type.name]
                         planes[slot.name] = torch.full(
-                            kernels.shape, slot.default, dtype=DTYPES[slot.type.name], device=self.device
+                            kernels.shape, slot.default, dtype=dtype, device=self.device
                         )
                 job.tick("")
-                for name, function in self._functions:
-                    if job.passes is None or name in job.passes:
+                for pass_, function in zip(self.program.passes, self._functions, strict=True):
+                    if job.passes is None or pass_.name in job.passes:
                         planes.update(function(kernels, planes))
-                        job.tick(name)
+                        job.tick(pass_.name)
         packed = {}
         for name, old in job.state.items():
             parts = [kernels.full(planes[piece.slot]) for piece in self._pieces[name]]
