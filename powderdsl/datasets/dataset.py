@@ -141,18 +141,6 @@ def open_shard(folder: Path, recipe: Recipe, row: ShardRow) -> Shard:
     return shard
 
 
-def read_episodes(folder: Path, recipe: Recipe, row: ShardRow) -> tuple[Array, Array]:
-    """The arrays `length` and `world` of a shard, whose other bytes are neither read nor checked.
-
-    Raises as `open_shard`.
-    """
-    path = folder / row.file
-    with _damage(path):
-        arrays = _read(path, shapes(recipe, row.number, row.transitions), only=("length", "world")).arrays
-        _check_lengths(arrays["length"].astype(np.int64), recipe, row.transitions)
-    return arrays["length"], arrays["world"]
-
-
 def _damage(path: Path) -> AbstractContextManager[None]:
     return reporting_damage(f"the shard {path} is damaged", "the command that recorded it records it again")
 
@@ -168,23 +156,18 @@ def _read(path: Path, expected: dict[str, tuple[int, ...]], only: tuple[str, ...
         for name in only:
             header, shape, dtype = archive.headers[name], expected[name], np.dtype(DTYPES[name])
             if (header.shape, header.dtype) != (shape, dtype.name):
-                raise BadArchive(
-                    f"`{name}` is {header.dtype} {list(header.shape)}, not {dtype} {list(shape)}"
-                )
+                is_there = f"{header.dtype} {list(header.shape)}"
+                raise BadArchive(f"`{name}` is {is_there}, not {dtype} {list(shape)}")
             if header.entry.compress_type == zipfile.ZIP_STORED:
-                start = _data_offset(whole, header.entry) + header.start
+                # A member's bytes follow its local header, whose name and extra field vary in length.
+                at = header.entry.header_offset + 30
+                sizes = np.frombuffer(whole[at - 4 : at].tobytes(), "<u2").tolist()
+                start = at + sum(sizes) + header.start
                 arrays[name] = np.ndarray(shape, dtype, buffer=whole, offset=start)
             else:
                 arrays[name] = archive.read(name)
                 loaded += header.size
     return Shard(arrays, loaded)
-
-
-def _data_offset(whole: Array, entry: zipfile.ZipInfo) -> int:
-    """The offset of a member's bytes, after its local header, whose name and extra field vary in length."""
-    at = entry.header_offset
-    name, extra = np.frombuffer(whole[at + 26 : at + 30].tobytes(), "<u2").tolist()
-    return int(at + 30 + name + extra)
 
 
 def _check_lengths(length: Array, recipe: Recipe, transitions: int) -> None:
@@ -376,10 +359,19 @@ class Dataset:
         return list(out.values())
 
     def lengths_and_worlds(self) -> tuple[Array, Array]:
-        """The number of actions and the world of every episode: int64 [episodes] each. Reads little of each shard."""
-        parts = [read_episodes(self.folder, self.recipe, row) for row in self.manifest.shards]
-        length, world = (np.concatenate(part).astype(np.int64) for part in zip(*parts, strict=True))
-        return length, world
+        """The number of actions and the world of every episode: int64 [episodes] each.
+
+        Other bytes of shards are neither read nor checked. Raises as `open_shard`.
+        """
+        lengths, worlds = [], []
+        for row in self.manifest.shards:
+            path, expected = self.folder / row.file, shapes(self.recipe, row.number, row.transitions)
+            with _damage(path):
+                arrays = _read(path, expected, only=("length", "world")).arrays
+                lengths.append(arrays["length"].astype(np.int64))
+                worlds.append(arrays["world"])
+                _check_lengths(lengths[-1], self.recipe, row.transitions)
+        return np.concatenate(lengths), np.concatenate(worlds).astype(np.int64)
 
     def _shard(self, number: int) -> Shard:
         """A shard, which stays open while there is room."""
@@ -564,11 +556,7 @@ def split(
     """
     check_choice("by", by, UNITS)
     check_count("seed", seed, (1 << 62) - 1, least=0)
-    if (
-        not fractions
-        or not all(fraction > 0 for fraction in fractions)
-        or not math.isclose(sum(fractions), 1)
-    ):
+    if not fractions or min(fractions) <= 0 or not math.isclose(sum(fractions), 1):
         raise ValueError(f"fractions must be positive and sum to 1, found {list(fractions)}")
     episodes = rows.episodes
     numbers = torch.from_numpy(np.zeros_like(episodes.number) if by == "world" else episodes.number + 1)
@@ -612,11 +600,8 @@ def flat(dataset: Dataset, layout: str = "d4rl") -> dict[str, NDArray[Any]]:
 
 def _episode(dataset: Dataset, number: int, layout: str) -> dict[str, NDArray[Any]]:
     episode = dataset.episode(number)
-    shown, action, reward = (
-        episode.observation.numpy(),
-        episode.action.numpy().astype(np.int32),
-        episode.reward.numpy(),
-    )
+    shown, reward = episode.observation.numpy(), episode.reward.numpy()
+    action = episode.action.numpy().astype(np.int32)
     terminated, truncated = episode.terminated.numpy(), episode.truncated.numpy()
     if layout == "d4rl":
         return {

@@ -29,8 +29,6 @@ USUAL_SHARD = 256
 USUAL_SHARD_BYTES = 1 << 28
 MAX_BYTES = 1 << 24
 """Size limit of a manifest."""
-MAX_VALUES = 1 << 19
-"""Limit of values in a manifest."""
 MAX_SHARD_BYTES = 1 << 32
 """Size limit of the unpacked arrays of one shard."""
 MAX_EPISODES = 1 << 32
@@ -133,7 +131,7 @@ def read_manifest(folder: Path) -> Manifest:
     """The manifest of a folder, every value checked. Raises CompileError (PD630), with all that is wrong."""
     path = folder / FILE
     try:
-        data = parse_json(read_bytes(path, MAX_BYTES), MAX_VALUES)
+        data = parse_json(read_bytes(path, MAX_BYTES))
         check_links(folder)
     except OSError as error:
         name = Path(error.filename or path).name
@@ -161,9 +159,8 @@ def _checked(path: Path, data: Any) -> Manifest:
         problems += _contradictions(manifest.recipe, manifest.shards)
     if manifest is None or problems:
         message, place = f"{path} is damaged", Label(None)
-        raise CompileError(
-            [Diagnostic("PD630", message, place, notes=(problem,)) for problem in problems[:20]]
-        )
+        notes = [(problem,) for problem in problems[:20]]
+        raise CompileError([Diagnostic("PD630", message, place, notes=note) for note in notes])
     return manifest
 
 
@@ -179,9 +176,8 @@ def check_place(folder: Path) -> None:
         return
     names = sorted(path.name for path in folder.iterdir() if not path.name.startswith("."))
     if names and FILE not in names:
-        raise damaged(
-            f"{folder} is not a dataset", f"it holds {names[0]} and no {FILE}", "take an empty folder"
-        )
+        reason = f"it holds {names[0]} and no {FILE}"
+        raise damaged(f"{folder} is not a dataset", reason, "take an empty folder")
 
 
 def damaged(message: str, reason: str, *helps: str) -> CompileError:
@@ -278,14 +274,10 @@ def episode_bytes(recipe: Recipe) -> int:
 
 def _contradictions(recipe: Recipe, shards: Sequence[ShardRow]) -> list[str]:
     problems, numbers = [], set()
-    if len(recipe.channels) != recipe.shape[0]:
-        problems.append(
-            f"{len(recipe.channels)} channels, but observations of the shape {list(recipe.shape)}"
-        )
-    if len(recipe.choices) != recipe.action_nvec[2]:
-        problems.append(
-            f"{len(recipe.choices)} choices, but {recipe.action_nvec[2]} values of an action for them"
-        )
+    if (channels := len(recipe.channels)) != recipe.shape[0]:
+        problems.append(f"{channels} channels, but observations of the shape {list(recipe.shape)}")
+    if (choices := len(recipe.choices)) != recipe.action_nvec[2]:
+        problems.append(f"{choices} choices, but {recipe.action_nvec[2]} values of an action for them")
     if recipe.shards > MAX_SHARDS:
         problems.append(f"{recipe.shards:,} shards, more than {MAX_SHARDS:,}")
     for place, row in enumerate(shards):

@@ -142,10 +142,8 @@ def _spec(recipe: Recipe) -> Any:
         task = load_task(recipe.task, knobs=recipe.knobs, params=params)
     except (CompileError, ValueError, KeyError):  # its knobs or parameters have changed
         return None
-    if (fingerprint(task), fingerprint(task.ruleset)) != (
-        recipe.task_fingerprint,
-        recipe.ruleset_fingerprint,
-    ):
+    recorded = recipe.task_fingerprint, recipe.ruleset_fingerprint
+    if (fingerprint(task), fingerprint(task.ruleset)) != recorded:
         return None
     spec = copy.deepcopy(gymnasium.spec(env_id(recipe.task)))
     spec.kwargs |= {
@@ -186,9 +184,8 @@ def from_minari(dataset_id: str, folder: str | Path) -> Dataset:
             if number not in recorded:
                 parts: dict[str, list[Array]] = {name: [] for name in DTYPES}
                 for episode in recipe.episodes_of(number):
-                    with reporting_damage(
-                        f"episode_{episode}: {source.storage.data_path} cannot be imported"
-                    ):
+                    what = f"episode_{episode}: {source.storage.data_path} cannot be imported"
+                    with reporting_damage(what):
                         for name, value in _episode(source, episode, recipe).items():
                             parts[name].append(value)
                 manifest = add_shard(place, manifest, number, parts)
@@ -213,9 +210,8 @@ def _exported_recipe(source: minari.MinariDataset) -> Recipe:
     folder, exported = source.storage.data_path, source.storage.metadata.get(KEY)
     if not isinstance(exported, dict) or not isinstance(exported.get("recipe"), dict):
         reason = "powderdsl did not write it, so its meaning is unknown"
-        raise damaged(
-            f"{folder} cannot be imported", reason, "`record` plays any policy, also one of another library"
-        )
+        fix = "`record` plays any policy, also one of another library"
+        raise damaged(f"{folder} cannot be imported", reason, fix)
     # Episodes may have been added since.
     return read_recipe(folder, exported["recipe"] | {"episodes": source.total_episodes})
 

@@ -147,9 +147,8 @@ def begin_manifest(folder: Path, recipe: Recipe) -> Manifest:
         if notes:
             helps = ("take another folder, or the values that it was begun with",)
             raise failure("PD631", f"{folder} has another dataset", notes=notes, helps=helps)
-        manifest = replace(
-            manifest, recipe=recipe, shards=tuple(row for row in manifest.shards if is_whole(folder, row))
-        )
+        intact = tuple(row for row in manifest.shards if is_whole(folder, row))
+        manifest = replace(manifest, recipe=recipe, shards=intact)
     write_manifest(folder, manifest)
     return manifest
 
@@ -240,12 +239,8 @@ class _Recording:
             progress(done + count - going + going * (step + 1) / recipe.actions, recipe.episodes)
             if not going:
                 break
-        ends = [
-            {"length": np.array([steps]), "world": np.array([world])}
-            for steps, world in zip(length, worlds, strict=True)
-        ]
         return [
-            {name: rows[slot, : length[slot] + (name == "observation")].copy() for name, rows in tape.items()}
-            | end
-            for slot, end in enumerate(ends)
+            {name: rows[slot, : steps + (name == "observation")].copy() for name, rows in tape.items()}
+            | {"length": np.array([steps]), "world": np.array([world])}
+            for slot, (steps, world) in enumerate(zip(length, worlds, strict=True))
         ]

@@ -97,13 +97,8 @@ def action_form(kind: str, agent: Agent, device: torch.device) -> ActionForm:
     check_choice("actions", kind, KINDS)
     rows, columns = agent.bins
     full_nvec = agent.action_nvec
-    read = (
-        columns > 1 and agent.choices != (NO_CHANGE,),
-        rows > 1 and agent.choices != (NO_CHANGE,),
-        len(agent.choices) > 1,
-        BLOW in agent.choices,
-        BLOW in agent.choices,
-    )
+    acts, blows = agent.choices != (NO_CHANGE,), BLOW in agent.choices
+    read = (columns > 1 and acts, rows > 1 and acts, len(agent.choices) > 1, blows, blows)
     table, weights = torch.tensor([UNREAD]), torch.zeros(len(agent.choices), 5, dtype=torch.int64)
     if kind == "discrete":
         table, weights = _discrete(agent)
@@ -117,14 +112,11 @@ def action_form(kind: str, agent: Agent, device: torch.device) -> ActionForm:
         space = MultiDiscrete(np.array(nvec))
     mask = torch.ones(sum(nvec), dtype=torch.bool)
     if kind == "full":
-        parts = mask.split(nvec)
-        for part, value, is_read in zip(parts, UNREAD, read, strict=True):
+        for part, value, is_read in zip(mask.split(nvec), UNREAD, read, strict=True):
             if not is_read:
                 part[:] = torch.arange(len(part)) == value
-    tensors = (torch.tensor(chosen, dtype=torch.int64), table, weights)
-    return ActionForm(
-        kind, space, names, nvec, mask.to(device), full_nvec, *(tensor.to(device) for tensor in tensors)
-    )
+    tensors = [part.to(device) for part in (mask, torch.tensor(chosen, dtype=torch.int64), table, weights)]
+    return ActionForm(kind, space, names, nvec, tensors[0], full_nvec, *tensors[1:])
 
 
 def _discrete(agent: Agent) -> tuple[Tensor, Tensor]:

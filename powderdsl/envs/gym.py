@@ -262,9 +262,8 @@ class GoalEnv(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         self.goal = self.low.copy()
         limit = float(np.finfo(np.float32).max)
         box = spaces.Box(-limit, limit, (count,), np.float32)
-        self.observation_space = spaces.Dict(
-            {"observation": env.observation_space, "achieved_goal": box, "desired_goal": box}
-        )
+        parts = {"observation": env.observation_space, "achieved_goal": box, "desired_goal": box}
+        self.observation_space = spaces.Dict(parts)
 
     @property
     def _tensors(self) -> TensorEnv:

@@ -174,9 +174,8 @@ class TensorEnv:
         self.action_form = action_form(actions, self.task.agent, self.device)
         self.single_action_space, self.action_nvec = self.action_form.space, self.action_form.nvec
         self.shows_mask = action_mask
-        self.last_action_terminates = last_action == "terminates" or (
-            last_action == "auto" and self.task.goal.final is not None
-        )
+        ends = {"auto": self.task.goal.final is not None, "terminates": True, "truncates": False}
+        self.last_action_terminates = ends[last_action]
         self.max_episode_steps = min(self.task.agent.actions, max_episode_steps or self.task.agent.actions)
         self.episodes: Episodes | None = None
         """The current worlds, to read; the next call writes to their tensors."""
@@ -341,9 +340,8 @@ class TensorEnv:
         waiting = self._ended
         if self.autoreset_mode is AutoresetMode.DISABLED:
             check_going(waiting)
-        after, reward, success, _ = self.program.act(
-            self.episodes, checked, reuse=True, params=self.params or None
-        )
+        params = self.params or None
+        after, reward, success, _ = self.program.act(self.episodes, checked, reuse=True, params=params)
         self.episodes = after
         failed, last = after.failed, after.acted >= self.task.agent.actions
         terminated = (success | failed | last) if self.last_action_terminates else success | failed

@@ -217,9 +217,8 @@ def evaluate(
             unchanged[name] = int((returns == returns[0]).all(0).sum())
         if name != config.split:
             new = torch.tensor([start not in training for start in _starts(program, worlds)])
-            without = {
-                name: mean_and_interval(of.returns[new].tolist()) for name, of in played.items() if new.any()
-            }
+            others = played if bool(new.any()) else {}
+            without = {name: mean_and_interval(of.returns[new].tolist()) for name, of in others.items()}
             seen[name] = Seen(int((~new).sum()), without)
         scores += [_score(name, policy, played, task) for policy in chosen]
     evaluation = Evaluation(task.name, step, deterministic, seed, tuple(scores), unchanged, seen)

@@ -78,11 +78,9 @@ class BinDistribution:
     def log_prob(self, actions: Tensor) -> Tensor:
         return self.distribution.log_prob(self.form.encode(actions.long()).to(actions.device))
 
-    def mode(self) -> Tensor:
-        return self.action(self.distribution.probs.argmax(1))
-
     def get_actions(self, deterministic: bool = False) -> Tensor:
-        return self.mode() if deterministic else self.action(self.distribution.sample())
+        chances = self.distribution
+        return self.action(chances.probs.argmax(1) if deterministic else chances.sample())
 
 
 class BinPolicy(ActorCriticPolicy):
@@ -154,25 +152,22 @@ class BinPolicy(ActorCriticPolicy):
             scores = torch.cat([scores, self.idle(features.mean((2, 3)))], 1)
         return BinDistribution(self.form, Categorical(logits=scores))
 
-    def _value(self, seen: Tensor) -> Tensor:
-        return self.judge(seen)
-
     def forward(self, observed: Any, deterministic: bool = False) -> tuple[Tensor, Tensor, Tensor]:
         seen = self._seen(observed)
         distribution = self._distribution(seen)
         actions = distribution.get_actions(deterministic)
-        return actions, self._value(seen), distribution.log_prob(actions)
+        return actions, self.judge(seen), distribution.log_prob(actions)
 
     def evaluate_actions(self, observed: Any, actions: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         seen = self._seen(observed)
         distribution = self._distribution(seen)
-        return self._value(seen), distribution.log_prob(actions), distribution.distribution.entropy()
+        return self.judge(seen), distribution.log_prob(actions), distribution.distribution.entropy()
 
     def get_distribution(self, observed: Any) -> Any:
         return self._distribution(self._seen(observed))
 
     def predict_values(self, observed: Any) -> Tensor:
-        return self._value(self._seen(observed))
+        return self.judge(self._seen(observed))
 
 
 BESIDES = ("task_fingerprint", "palette", "channels", "shaped_fingerprint")
@@ -218,8 +213,7 @@ class TrainedPolicy:
             drawn = uniforms(keys, len(choices))
             below = [choice.probs.double().cumsum(1) for choice in choices]
             indices = [
-                (drawn[:, column, None] * bounds[:, -1:] >= bounds).sum(1)
-                for column, bounds in enumerate(below)
+                (drawn[:, i, None] * bounds[:, -1:] >= bounds).sum(1) for i, bounds in enumerate(below)
             ]
         return distribution.action(indices[0]) if joint else torch.stack(indices, 1)
 
@@ -255,9 +249,8 @@ def load_policy(run: RunFolder | str | Path, env: TensorEnv, *, deterministic: b
     kind, how = policy_of(config, own)
     space = own.observation.space
     if config.frames > 1:
-        space = Box(
-            space.low.repeat(config.frames, 0), space.high.repeat(config.frames, 0), dtype=space.dtype.type
-        )
+        low, high = (bound.repeat(config.frames, 0) for bound in (space.low, space.high))
+        space = Box(low, high, dtype=space.dtype.type)
     actions, rate = MultiDiscrete(np.array(own.action_nvec)), config.learning_rate
     network = kind(space, actions, lambda _: rate, **how | {"optimizer_class": _NoOptimizer})
     with reporting_misfits(folder.path, "its network is another"):

@@ -129,7 +129,9 @@ def train(config: TrainConfig, folder: str | Path, *, progress: Progress | None 
             try:
                 learner.model.learn(config.steps - step, keeper, reset_num_timesteps=checkpoint is None)
             except KeyboardInterrupt:
-                keeper.save_latest()
+                # The state before the rollout that is in progress, unless it has been saved.
+                if keeper.latest is not None and keeper.latest[0]:
+                    run.save_checkpoint(*keeper.latest)
                 raise
             keeper.play_held_out(learner.step)
             run.save_checkpoint(learner.step, learner.state())
@@ -187,9 +189,7 @@ class _Learner:
             "optimizer": model.policy.optimizer.state_dict(),
             "env": self.worlds.state(),
             "starts": torch.as_tensor(np.asarray(model._last_episode_starts)),
-            "episodes": [
-                [episode["r"], episode["l"], episode["t"]] for episode in model.ep_info_buffer or ()
-            ],
+            "episodes": [[episode[key] for key in "rlt"] for episode in model.ep_info_buffer or ()],
             "successes": [bool(success) for success in model.ep_success_buffer or ()],
             "updates": model._n_updates,
             # Of the update that is shown after the next rollout.
@@ -219,7 +219,7 @@ class _Learner:
             self.normal.returns[...] = state["returns"].numpy()
         model._last_episode_starts = state["starts"].numpy()
         size = model._stats_window_size
-        episodes = ({"r": r, "l": length, "t": t} for r, length, t in state["episodes"])
+        episodes = (dict(zip("rlt", values, strict=True)) for values in state["episodes"])
         model.ep_info_buffer = deque(episodes, maxlen=size)
         model.ep_success_buffer = deque(state["successes"], maxlen=size)
         model._n_updates, model.num_timesteps = state["updates"], state["steps"]
@@ -370,11 +370,6 @@ class _Keeper(BaseCallback):
         interval = {} if half is None else {"held_out/interval": half}
         self.metrics.write(step, {"held_out/return": mean, **interval})
 
-    def save_latest(self) -> None:
-        """Save the state before the rollout that is in progress, unless that has been done."""
-        if self.latest is not None and self.latest[0]:
-            self.run.save_checkpoint(*self.latest)
-
 
 class _MetricsWriter(KVWriter):
     """Writes the log of Stable-Baselines3 as metrics of the run."""
@@ -391,9 +386,8 @@ class _MetricsWriter(KVWriter):
 
 def _numbers(values: Mapping[str, Any]) -> dict[str, float]:
     """The values that are numbers: Python's or NumPy's."""
-    return {
-        name: float(value) for name, value in values.items() if isinstance(value, int | float | np.number)
-    }
+    kinds = int | float | np.number
+    return {name: float(value) for name, value in values.items() if isinstance(value, kinds)}
 
 
 # Random numbers

@@ -208,9 +208,8 @@ class Session:
             rules = set_params(rules, changed, reporter)
             reporter.raise_if_errors()
             sim = Simulator(rules, "wasm", tensors=False, memo=self.memo)
-        return trace_text(trace(self._world(world, sim), int(row), int(column), 1)).replace(
-            f"{self.folder}/", ""
-        )
+        text = trace_text(trace(self._world(world, sim), int(row), int(column), 1))
+        return text.replace(f"{self.folder}/", "")
 
     def save(self, world: dict[str, Any]) -> bytes:
         """A world as an .npz, which `powderdsl run` continues."""
@@ -250,9 +249,8 @@ class Session:
             if name not in ours:
                 raise BadRequest(f"the rules have no element {name}")
             table[int(number)] = ours[name]
-        ids = np.frombuffer(base64.b64decode(data["ids"]).translate(bytes(table)), np.uint8).reshape(
-            (1, *shape)
-        )
+        octets = base64.b64decode(data["ids"]).translate(bytes(table))
+        ids = np.frombuffer(octets, np.uint8).reshape((1, *shape))
         fields: dict[str, Any] = {}
         names = qualified_slots(rules).values()
         for name, field in data["fields"].items():

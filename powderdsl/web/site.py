@@ -13,7 +13,8 @@ import re
 import shutil
 import zipfile
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import cache, cached_property, partial
 from http import HTTPStatus
@@ -122,9 +123,8 @@ def shipped_entries() -> list[Entry]:
     variants = shipped_variants()
     entries = [Entry(name, (name,)) for name in shipped_tests() if name not in variants]
     entries.sort(key=lambda entry: (-used[entry.key], -len(entry.ruleset.elements)))
-    return entries + [
-        _example(path.stem, entries[0].key) for path in sorted(examples_folder().glob("*.yaml"))
-    ]
+    examples = sorted(examples_folder().glob("*.yaml"))
+    return entries + [_example(path.stem, entries[0].key) for path in examples]
 
 
 def _example(stem: str, rules: str) -> Entry:
@@ -267,9 +267,8 @@ class _Handler(BaseHTTPRequestHandler):
         own = {f"{name}:{self.server.server_port}" for name in (ADDRESS, "localhost")}
         origin = self.headers.get("Origin")
         # A page elsewhere can neither name this server (Host) nor read it from its own origin (Origin).
-        if self.headers.get("Host") not in own or (
-            origin and origin not in {f"http://{host}" for host in own}
-        ):
+        is_ours = not origin or origin in {f"http://{host}" for host in own}
+        if self.headers.get("Host") not in own or not is_ours:
             self._answer(HTTPStatus.FORBIDDEN, b"this server answers its own page only", "txt")
             return
         path = unquote(urlsplit(self.path).path).lstrip("/") or "index.html"
@@ -415,7 +414,12 @@ def offered_worlds(ruleset: Ruleset, names: Sequence[str]) -> tuple[list[dict[st
 
     `names` are the arguments of `load`: an added pack gets a world with its elements.
     """
-    worlds = [*_scenes(ruleset)]
+    worlds = []
+    for scene in shipped_scenes():
+        with suppress(CompileError):  # the rules lack its elements
+            start = draw_start(scene, ruleset)
+            fields = {name: field.values for name, field in start.fields.items()}
+            worlds.append(_named(scene.name, scene.about or "", ruleset, start.ids, fields))
     shown = worlds[-1]["name"] if worlds else "shapes"
     shapes = strew(ruleset, (SIDE, SIDE), 1, 0)[0]
     worlds.append(_named("shapes", "Random shapes of all elements.", ruleset, shapes))
@@ -431,17 +435,6 @@ def offered_worlds(ruleset: Ruleset, names: Sequence[str]) -> tuple[list[dict[st
 
 def _named(name: str, about: str, ruleset: Ruleset, ids: Any, fields: Any = None) -> dict[str, Any]:
     return {"name": name, "about": about} | world_data(ruleset, ids, fields or {}, (0, 0, 0))
-
-
-def _scenes(ruleset: Ruleset) -> Iterator[dict[str, Any]]:
-    """The shipped scenes whose elements the rules have."""
-    for scene in shipped_scenes():
-        try:
-            start = draw_start(scene, ruleset)
-        except CompileError:
-            continue
-        fields = {name: field.values for name, field in start.fields.items()}
-        yield _named(scene.name, scene.about or "", ruleset, start.ids, fields)
 
 
 def task_worlds() -> dict[str, list[dict[str, Any]]]:
