@@ -250,10 +250,8 @@ class _Move:
         if condition is None or syntax is None:
             return None
         # A move knows neither what was before nor the last action.
-        if any(
-            part.op in ("start", "before") or (part.op == "action" and part.value not in ("taken", "left"))
-            for part in parts_of(condition)
-        ):
+        parts = [part for part in parts_of(condition) if part.value not in ("taken", "left")]
+        if any(part.op in ("start", "before", "action") for part in parts):
             message, label = "a move sees the world as it is now", "what was before is not known here"
             helps = ["use `count(…)`, `share(…)`, `taken` or `left`"]
             self.reader.reporter.error("PD406", message, syntax.span, label, helps=helps)

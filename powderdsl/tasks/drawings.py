@@ -365,9 +365,7 @@ def element_ids(word: Written, ruleset: Ruleset, reporter: Reporter) -> tuple[in
         return (element.id,)
     tagged = tuple(element.id for element in ruleset.elements if word.text in element.tags)
     if not tagged:
-        known = {element.name for element in ruleset.elements} | {
-            tag for element in ruleset.elements for tag in element.tags
-        }
+        known = {name for element in ruleset.elements for name in (element.name, *element.tags)}
         helps = suggest(word.text, known, "its elements")
         label = "neither an element nor a tag of these rules"
         reporter.error("PD604", f"unknown element `{word.text}`", word.span, label, helps=helps)

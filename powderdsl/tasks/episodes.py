@@ -70,9 +70,8 @@ class TaskProgram:
         """Regions that are the same in all worlds of the split, bool [1, H, W]."""
         self._meter = Meter(simulator.ruleset, self.measures, task.size, self._fixed, device)
         goal = task.goal
-        self._counts_always = (goal.each, goal.success, goal.failure) != (None, None, None) or any(
-            part.op == "before" for part in scalars
-        )
+        asks_now = (goal.each, goal.success, goal.failure) != (None, None, None)
+        self._counts_always = asks_now or any(part.op == "before" for part in scalars)
         """Whether measures are needed after every action, and not only after the last."""
         self._asked = {part.value for part in scalars if part.op == "action"}
         """The numbers of actions that the goal reads."""

@@ -245,22 +245,17 @@ class _TaskReader:
 
     def take(self, word: Written) -> None:
         """Report a new name that already means something, or that statements and expressions need."""
-        keywords = reserved_words() | reserved_words(STATEMENTS)
+        keywords, symbols = reserved_words() | reserved_words(STATEMENTS), self.typer.symbols
+        means = self.ruleset.element(word.text) or symbols.constants.get(word.text)
         if word.text in keywords | {*ACTION_WORDS, *FUNCTIONS, *RULE_FUNCTIONS}:
             self.reporter.error("PD311", f"`{word.text}` is a reserved word", word.span, "taken")
         elif word.text in self.taken:
             message = f"`{word.text}` already means something"
             self.reporter.error("PD308", message, word.span, "second meaning")
-        elif self.is_name(word.text):
+        elif means and symbols.names.pack(word.text) in (None, *self.own):
             label = "the rules use this word"
             self.reporter.error("PD308", f"`{word.text}` hides another `{word.text}`", word.span, label)
         self.taken.add(word.text)
-
-    def is_name(self, word: str) -> bool:
-        """True if a word means something in the task's own rules."""
-        symbols = self.typer.symbols
-        pack = symbols.names.pack(word)
-        return pack in (None, *self.own) and bool(self.ruleset.element(word) or symbols.constants.get(word))
 
     def knobs(self) -> tuple[Knob, ...]:
         knobs: dict[str, Knob] = {}
@@ -295,10 +290,8 @@ class _TaskReader:
             return None
         low, high, usual = int(ends.kind.lo), int(ends.kind.hi), int(amount.value)
         chosen = int(self.values.get(key.text, usual))
-        for value, span in (
-            (usual, default.span),
-            (chosen, None if key.text in self.values else default.span),
-        ):
+        written = None if key.text in self.values else default.span
+        for value, span in ((usual, default.span), (chosen, written)):
             if not low <= value <= high:
                 message = f"the knob `{key.text}` must lie in {low}..{high}"
                 self.reporter.error("PD803", message, span, f"{value} lies outside", notes=[f"it is {value}"])
@@ -382,11 +375,8 @@ class _TaskReader:
 
     def goal(self, checker: GoalChecker) -> Goal:
         reward, end = self.decl.reward or RewardDecl(), self.decl.end or EndDecl()
-        each, final, shaped = (
-            None if line is None else checker.number(line)
-            for line in (reward.each, reward.final, reward.shaped)
-        )
-        success, failure = (
-            None if line is None else checker.condition(line) for line in (end.success, end.failure)
-        )
+        lines = (reward.each, reward.final, reward.shaped)
+        each, final, shaped = (checker.number(line) if line else None for line in lines)
+        ends = (end.success, end.failure)
+        success, failure = (checker.condition(line) if line else None for line in ends)
         return Goal(each, final, success, failure, shaped)

@@ -150,13 +150,9 @@ class GoalChecker:
             helps = suggest(syntax.text, known)
             message = f"unknown name `{syntax.text}`"
             return self.typer.fail("PD301", message, syntax.span, "not defined", *helps)
-        return self.typer.fail(
-            "PD401",
-            "expected one number of the whole world",
-            syntax.span,
-            "this is something of each cell",
-            f"write `count({text})`, or `share({text})`",
-        )
+        message, label = "expected one number of the whole world", "this is something of each cell"
+        fix = f"write `count({text})`, or `share({text})`"
+        return self.typer.fail("PD401", message, syntax.span, label, fix)
 
     # Numbers of the whole world
 
@@ -170,8 +166,7 @@ class GoalChecker:
         if not least <= len(parts) <= most:
             expected = "1 value" if most == 1 else f"{least} to {most} values"
             message = f"`{name}` takes {expected}, found {len(parts)}"
-            usage = (f"write `{FUNCTIONS[name]}`",)
-            raise self.typer.fail("PD406", message, syntax.span, "", *usage)
+            raise self.typer.fail("PD406", message, syntax.span, "", f"write `{FUNCTIONS[name]}`")
         if name in ARITHMETIC:
             values = [self.scalar(part) for part in parts]
             if name == "abs":

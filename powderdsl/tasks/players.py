@@ -34,9 +34,8 @@ class ExpertPlayer:
         most = [move.most for move in expert.moves if move.most is not None]
         self.measures = tuple(dict.fromkeys([*most, *measures_in(scalars)]))
         self._numbers = {measure: number for number, measure in enumerate(self.measures)}
-        self._meter = Meter(
-            program.simulator.ruleset, self.measures, program.task.size, {}, program.simulator.device
-        )
+        ruleset, device = program.simulator.ruleset, program.simulator.device
+        self._meter = Meter(ruleset, self.measures, program.task.size, {}, device)
         self._plans: dict[int, Tensor] = {}
         """Of a search: int64 [actions, 5] by world."""
 
@@ -113,20 +112,14 @@ def best_plans(program: TaskProgram, worlds: Tensor, count: int) -> Tensor:
     for first in range(0, count, together):
         numbers = torch.arange(first, min(first + together, count), device=device)
         seeds = worlds.repeat(len(numbers))  # plan by plan
-        plan_numbers = numbers.repeat_interleave(len(worlds))
-        plans = torch.stack(
-            [
-                (uniforms(action_keys(PLANS, seeds, plan_numbers * agent.actions + step), 5) * nvec).long()
-                for step in range(agent.actions)
-            ],
-            1,
-        )
+        places = numbers.repeat_interleave(len(worlds)) * agent.actions
+        keys = (action_keys(PLANS, seeds, places + step) for step in range(agent.actions))
+        plans = torch.stack([(uniforms(key, 5) * nvec).long() for key in keys], 1)
         plan_returns = _returns(program, seeds, plans).view(len(numbers), len(worlds))
         top = plan_returns.argmax(0)
         better = plan_returns.gather(0, top[None])[0]
-        chosen = plans.view(len(numbers), len(worlds), agent.actions, 5)[
-            top, torch.arange(len(worlds), device=device)
-        ]
+        plans = plans.view(len(numbers), len(worlds), agent.actions, 5)
+        chosen = plans[top, torch.arange(len(worlds), device=device)]
         wins = better > returns
         best[wins], returns[wins] = chosen[wins], better[wins]
     return best
