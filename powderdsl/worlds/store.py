@@ -45,9 +45,8 @@ def save(world: World, path: str | Path) -> None:
         raise TypeError(f"save takes a World, found {type(world).__name__}")
     target = Path(path)
     if target.suffix.lower() != ".npz":
-        raise ValueError(
-            f"a saved world's name ends in .npz, found {target.name!r}; see powderdsl.gif for animations"
-        )
+        helps = "see powderdsl.gif for animations"
+        raise ValueError(f"a saved world's name ends in .npz, found {target.name!r}; {helps}")
     check_saved(target, world.shape)
     ruleset = world.sim.ruleset
     about = {
@@ -115,23 +114,17 @@ KINDS = "worlds are .npz, .png, .txt and .yaml files, FILE.yaml#NAME, or a shipp
 def drawn_world(name: str, ruleset: Ruleset, size: Size | None) -> Start:
     """A picture, an ASCII drawing or a scene; only scenes set fields and can have another `size`."""
     suffix = Path(name).suffix.lower()
-    if suffix == ".png":
-        _refuse_size(size, "a picture")
-        return Start(read_image(name, ruleset.elements), {})
-    if suffix == ".txt":
-        _refuse_size(size, "a drawing")
-        return Start(load_ascii(name, ruleset.elements), {})
+    if suffix in (".png", ".txt"):
+        kind, read = ("a picture", read_image) if suffix == ".png" else ("a drawing", load_ascii)
+        if size is not None:
+            raise ValueError(f"size does not go with this world: {kind} has its own")
+        return Start(read(name, ruleset.elements), {})
     if suffix not in (".yaml", ".yml"):
         if Path(name).is_file():
             raise failure("PD602", f"cannot tell what {name} is", helps=(KINDS,))
         if re.search(r"\.[A-Za-z0-9]{1,5}\Z", name):
             raise failure("PD601", f"no world {name}", helps=(KINDS,))
     return load_start(name, ruleset, size=size)
-
-
-def _refuse_size(size: Size | None, kind: str) -> None:
-    if size is not None:
-        raise ValueError(f"size does not go with this world: {kind} has its own")
 
 
 def fresh_world(sim: Simulator, start: Start, seed: int) -> World:
@@ -252,20 +245,16 @@ def world_data(
     ruleset: Ruleset, ids: Any, fields: Mapping[str, Any], clock: tuple[int, int, int]
 ) -> dict[str, Any]:
     """A world as JSON: ids [H, W], whole fields [H, W] or [2, H, W] by qualified name, seed, index and step."""
-    qualified = qualified_slots(ruleset)
+    qualified, written = qualified_slots(ruleset), {}
+    for name, values in fields.items():
+        about = {"type": str(values.dtype), "components": 2 if values.ndim == 3 else 1}
+        written[qualified.get(name, name)] = {**about, "values": _text(values.tobytes())}
     return {
         "rows": int(ids.shape[0]),
         "columns": int(ids.shape[1]),
         "palette": {str(element.id): element.qualified for element in ruleset.elements},
         "ids": _text(ids.astype("uint8").tobytes()),
-        "fields": {
-            qualified.get(name, name): {
-                "type": str(values.dtype),
-                "components": 2 if values.ndim == 3 else 1,
-                "values": _text(values.tobytes()),
-            }
-            for name, values in fields.items()
-        },
+        "fields": written,
         "clock": [str(number) for number in clock],
     }
 

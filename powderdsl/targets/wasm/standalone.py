@@ -119,9 +119,8 @@ class Standalone(Batches):
         for slot in self.face.fields:
             self.reads[slot.name] = define(partial(self._read, slot), "read")
             self.takes[slot.name] = define(partial(self._take_values, slot), "take_values")
-        self.define(
-            self.cells, self.step, self.clock, self.field, self.take, self.paint, self.set, export=True
-        )
+        self.define(self.cells, self.step, self.clock, self.field, self.take, export=True)
+        self.define(self.paint, self.set, export=True)
         module.start(define(self._start))
         module.custom("powderdsl", self.face.about)
         module.pages = self.end // PAGE + 1
@@ -155,16 +154,14 @@ class Standalone(Batches):
 
     def _put(self, slots: Iterable[Stored]) -> None:
         """Load the ids and fields that the host sees into the world."""
-        body.do(self._load(self.face.element, self.cells_at, 1))
+        self._move("load", self.face.element, self.cells_at, 1)
         for slot in slots:
             for piece, at, _ in self.parts[slot.name]:
-                body.do(self._load(piece, at, slot.size))
+                self._move("load", piece, at, slot.size)
 
-    def _load(self, piece: Piece, address: Value | int, size: int) -> Value:
-        return self.calls["load"](self.batch, *numbers_of(piece, self.layout, size), address, 0)
-
-    def _store(self, piece: Piece, address: Value | int, size: int) -> Value:
-        return self.calls["store"](self.batch, *numbers_of(piece, self.layout, size), address, 0)
+    def _move(self, how: str, piece: Piece, address: Value | int, size: int) -> None:
+        """`load` or `store` the cells of a piece."""
+        body.do(self.calls[how](self.batch, *numbers_of(piece, self.layout, size), address, 0))
 
     def cells(self) -> Value:
         return self.cells_at
@@ -177,7 +174,7 @@ class Standalone(Batches):
         return self.batch + HEADER
 
     def show(self) -> Value:
-        body.do(self._store(self.face.element, self.cells_at, 1))
+        self._move("store", self.face.element, self.cells_at, 1)
         return self.cells_at
 
     # Fields
@@ -185,7 +182,7 @@ class Standalone(Batches):
     def _read(self, slot: Stored) -> None:
         """Write the values of a field into its buffer."""
         for piece, at, _ in self.parts[slot.name]:
-            body.do(self._store(piece, at, slot.size))
+            self._move("store", piece, at, slot.size)
 
     def _take_values(self, slot: Stored) -> None:
         """Load a field from its buffer, clamped to values that cells can have; `show` must have run before."""
@@ -212,7 +209,7 @@ class Standalone(Batches):
                     holders = self._data(bytes(i in slot.holders for i in range(256)))
                     with body.when(load("i32.load8_u", identity, holders).equals(0)):
                         cell.set(_fresh_value(piece, identity, usual))
-            body.do(self._load(piece, at, slot.size))
+            self._move("load", piece, at, slot.size)
 
     def field(self, number: I32) -> int:
         for slot in _of_number(number, self.face.fields):
@@ -316,8 +313,4 @@ def _limit(value: Value, threshold: Threshold) -> Value:
     """The number of draws below a chance, or not above it, as in `codec.limits`."""
     count = 1 << threshold.bits
     scaled = op("f64.sub", value * count, 0.5)
-    if threshold.strict:
-        limit = op("f64.ceil", scaled)
-    else:
-        limit = op("f64.floor", scaled) + 1
-    return _within(limit, 0, count)
+    return _within(op("f64.ceil", scaled) if threshold.strict else op("f64.floor", scaled) + 1, 0, count)

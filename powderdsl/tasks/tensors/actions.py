@@ -30,9 +30,8 @@ def put_worlds(world: World, places: Tensor, part: World, *, reuse: bool) -> Wor
     if isinstance(world.state, PackedState):
         state = world.state.put(places.cpu(), part.state, reuse=reuse)
     else:
-        state = {
-            name: put_rows(value, places, part.state[name], reuse) for name, value in world.state.items()
-        }
+        old, new = world.state, part.state
+        state = {name: put_rows(old[name], places, new[name], reuse) for name in old}
     seed, index, step = (put_rows(getattr(world, name), places, getattr(part, name), reuse) for name in CLOCK)
     return World(world.sim, state, seed, index, step)
 

@@ -95,13 +95,10 @@ def join_worlds(kind: ArrayKind, parts: Sequence[Made], fixed: Mapping[str, Arra
         cells = [xp.broadcast_to(part.regions[name], part.ids.shape) for part in parts]
         regions[name] = xp.concatenate(cells)
     targets = {name: xp.concatenate([part.targets[name] for part in parts]) for name in parts[0].targets}
-    fields = {
-        name: (
-            xp.concatenate([part.fields[name][0] for part in parts]),
-            xp.concatenate([part.fields[name][1] for part in parts]),
-        )
-        for name in parts[0].fields
-    }
+    fields = {}
+    for name in parts[0].fields:
+        values, where = zip(*(part.fields[name] for part in parts), strict=True)
+        fields[name] = xp.concatenate(values), xp.concatenate(where)
     return Made(xp.concatenate([part.ids for part in parts]), regions, targets, fields)
 
 
@@ -207,10 +204,8 @@ class WorldMaker:
         batch, fields = len(seeds), dict[str, tuple[Array, Array]]()
         for slot in self.slots:
             shape = (batch, *self.size) if slot.planes == 1 else (batch, slot.planes, *self.size)
-            fields[slot.name] = (
-                self.kind.zeros(slot.dtype, shape),
-                self.kind.zeros("bool", (batch, *self.size)),
-            )
+            where = self.kind.zeros("bool", (batch, *self.size))
+            fields[slot.name] = self.kind.zeros(slot.dtype, shape), where
         ids = self._painted(self.generator.fill, self.generator.groups, hashes, names, regions, fields)
         targets = {
             target.name: self._painted(NOTHING, target.groups, hashes, names, regions, {})
@@ -286,18 +281,16 @@ class _Painter:
     ):
         """`active`: bool [B, R], whether a world has a repetition."""
         self.maker, self.drawing, self.hashes = maker, drawing, hashes
-        kind, shape = maker.kind, tuple(active.shape)
-        self.active = kind.xp.asarray(active, dtype=kind.xp.uint8)
+        kind, xp, shape = maker.kind, maker.kind.xp, tuple(active.shape)
+        self.active = xp.asarray(active, dtype=xp.uint8)
         draws = _Draws(hashes, drawing.number, shape[1], names, drawing.amounts, len(drawing.ids))
-        self.numbers = [
-            None if array is None else kind.xp.broadcast_to(array, shape) for array in draws.arrays
-        ]
+        self.numbers = [None if array is None else xp.broadcast_to(array, shape) for array in draws.arrays]
         ids = kind.put(list(drawing.ids) or [0], "uint8")
-        self.ids = kind.xp.broadcast_to(ids if draws.choice is None else ids[draws.choice], shape)
+        self.ids = xp.broadcast_to(ids if draws.choice is None else ids[draws.choice], shape)
         self.is_fixed = constants(drawing.amounts) is not None
         if drawing.kind not in _WITHOUT_ROWS and not self.is_fixed:
             rows = shape_rows(kind, drawing.kind, self.numbers, maker.size)
-            first, last = (kind.xp.broadcast_to(edge, (*shape, maker.size[1])) for edge in rows)
+            first, last = (xp.broadcast_to(edge, (*shape, maker.size[1])) for edge in rows)
             self.rows = first, last * self.active[..., None]  # no rows without the repetition
 
     def painted(
@@ -370,11 +363,9 @@ class _Painter:
         limit = (percent[:, repeat, None] << CHANCE_BITS) // 100
         height, width = self.maker.size
         halves = kind.arange(2 * width * -(-height // 64))
-        below = kind.xp.zeros_like(halves)[None]
+        below, last = kind.xp.zeros_like(halves)[None], repeat * _NUMBERS + _NUMBERS - 1
         for place in range(CHANCE_BITS):
-            counters = (
-                ((halves + 1) * CHANCE_BITS + place) * (_NUMBERS * 256) + repeat * _NUMBERS + _NUMBERS - 1
-            )
+            counters = ((halves + 1) * CHANCE_BITS + place) * (_NUMBERS * 256) + last
             drawn = self.hashes.draw(self.drawing.number, counters)
             bit = -(limit >> place & 1)
             below = (bit & ~drawn) | (~(bit ^ drawn) & below)
@@ -418,12 +409,7 @@ class StartWorlds:
         # Back from the order of variants to that of the seeds.
         worlds = sorted(range(len(variants)), key=variants.__getitem__)
         order = self.kind.put(sorted(worlds, key=worlds.__getitem__), "int64")
-        regions = {
-            name: cells if name in self.fixed else cells[order] for name, cells in batch.regions.items()
-        }
-        return Made(
-            batch.ids[order],
-            regions,
-            {name: target[order] for name, target in batch.targets.items()},
-            {name: (values[order], where[order]) for name, (values, where) in batch.fields.items()},
-        )
+        regions = {name: cells[order] for name, cells in batch.regions.items() if name not in self.fixed}
+        targets = {name: target[order] for name, target in batch.targets.items()}
+        fields = {name: (values[order], where[order]) for name, (values, where) in batch.fields.items()}
+        return Made(batch.ids[order], {**self.fixed, **regions}, targets, fields)

@@ -88,23 +88,17 @@ class Meter:
 
     def _cell_counts(self, program: NativeProgram) -> CellCounts | None:
         """Return a counter of all measures in packed worlds, if bit planes show all cells that are counted."""
-        values = [
-            (i, measure)
-            for i, measure in enumerate(self.measures)
-            if measure.how in ("count", "share", "highest")
-        ]
+        counted_ways = ("count", "share", "highest")
+        values = [(i, measure) for i, measure in enumerate(self.measures) if measure.how in counted_ways]
         regions = {measure.region for measure in self.measures if measure.region is not None}
         if not values or len(values) < len(self.measures) or not regions <= self._fixed.keys():
             return None
         try:
             (pass_,) = lower_bits(_lowered(self.ruleset, values)).passes
-            flags = dict(pass_.outputs)
-            counted = [
-                Counted(
-                    flags[f"measure {i}"], measure.region, measure.how == "highest", self._cells_of(measure)
-                )
-                for i, measure in values
-            ]
+            flags, counted = dict(pass_.outputs), []
+            for i, measure in values:
+                flag, is_highest = flags[f"measure {i}"], measure.how == "highest"
+                counted.append(Counted(flag, measure.region, is_highest, self._cells_of(measure)))
             masks = {name: pack(cells[0]) for name, cells in self._fixed.items()}
             masks |= {REGION_LET + name: words for name, words in masks.items()}
             everywhere = torch.ones(1, *self.size, dtype=torch.bool, device=self.device)
@@ -199,13 +193,11 @@ class _Cells:
         self, world: World, regions: Mapping[str, Tensor], params: Mapping[str, Any] | None
     ) -> dict[int, Tensor]:
         """The value of each cell, [B, H, W], by the measure's number. `params` are those that differ from the rules' own."""
-        values = {
-            param.name: (params or {}).get(param.name, float(param.default)) for param in self.ruleset.params
-        }
-        every = {
-            name: torch.as_tensor(value, dtype=torch.float64, device=self.device).expand(len(world))
-            for name, value in values.items()
-        }
+        every = {}
+        for param in self.ruleset.params:
+            value = (params or {}).get(param.name, float(param.default))
+            values = torch.as_tensor(value, dtype=torch.float64, device=self.device)
+            every[param.name] = values.expand(len(world))
         none = torch.zeros(0, dtype=torch.int64, device=self.device)
         kernels = Kernels((len(world), *self.size), self.device, every, {}, {}, none, none, world.step)
         planes: dict[str, Tensor] = {}
@@ -250,11 +242,9 @@ def _value(scalar: Expr, facts: Facts) -> Tensor:
             return _value(scalar.args[0], replace(facts, now=then))
     args = [_value(arg, facts) for arg in scalar.args]
     value = _VALUES[scalar.op](*args)
-    if scalar.op in ("div", "quotient", "mod") and not (
-        scalar.args[1].op == "const" and scalar.args[1].value
-    ):
-        return value.masked_fill(args[1] == 0, 0)
-    return value
+    if scalar.op not in ("div", "quotient", "mod") or (scalar.args[1].op == "const" and scalar.args[1].value):
+        return value
+    return value.masked_fill(args[1] == 0, 0)
 
 
 _VALUES: Mapping[str, Callable[..., Tensor]] = {

@@ -119,10 +119,8 @@ def two_integers(node: yaml_tree.Node) -> Size | None:
 def _read_size(node: yaml_tree.Node, reporter: Reporter) -> Size | None:
     size = two_integers(node)
     if size is None:
-        helps = ["size: [64, 64]"]
-        reporter.error(
-            "PD607", "a size is [rows, columns]", first_line(node), "not two integers", helps=helps
-        )
+        message, label, helps = "a size is [rows, columns]", "not two integers", ["size: [64, 64]"]
+        reporter.error("PD607", message, first_line(node), label, helps=helps)
     elif 0 in size or size[0] * size[1] > MAX_CELLS:
         message = f"a world of {size[0]}×{size[1]} cells"
         reporter.error("PD607", message, node.span, "too small or too large", helps=[SIZE_RULE])
@@ -133,17 +131,13 @@ def _read_size(node: yaml_tree.Node, reporter: Reporter) -> Size | None:
 def covers_nothing(span: Span | None, what: str, size: Size, reporter: Reporter) -> None:
     """Report a shape that covers no cell of the world."""
     rows, columns = size
-    reporter.error(
-        "PD608",
-        "a shape that covers no cell",
-        span,
-        f"{what} in the {rows}×{columns} world",
-        helps=[f"rows are 0 to {rows - 1}, columns 0 to {columns - 1}; rows come first"],
-    )
+    label = f"{what} in the {rows}×{columns} world"
+    fix = f"rows are 0 to {rows - 1}, columns 0 to {columns - 1}; rows come first"
+    reporter.error("PD608", "a shape that covers no cell", span, label, helps=[fix])
 
 
 def _read_statements(node: yaml_tree.Node, reader: Reader) -> tuple[Paint | Setting, ...]:
-    """A list of statements, or a `|` block with one a line."""
+    """A list of statements, or a `|` block with one a line, of which some are empty or comments."""
     spans: list[Span] = []
     if isinstance(node, yaml_tree.Sequence):
         for item in node.items:
@@ -155,7 +149,11 @@ def _read_statements(node: yaml_tree.Node, reader: Reader) -> tuple[Paint | Sett
             elif isinstance(item, yaml_tree.Sequence):
                 reader.shape(item, "a statement")
     elif isinstance(node, yaml_tree.Scalar) and node.style == "block":
-        spans = _lines(node.content)
+        start = node.content.start
+        for line in node.content.text.splitlines(keepends=True):
+            if statement := line.split("#")[0].rstrip():
+                spans.append(Span(node.content.source, start, start + len(statement)))
+            start += len(line)
     elif not (isinstance(node, yaml_tree.Scalar) and node.text == ""):
         reader.shape(node, "a list of statements", "write `draw:` and below it one `- statement` a line")
     return tuple(paint for span in spans if (paint := parse_statement(span, reader.reporter)))
@@ -164,17 +162,6 @@ def _read_statements(node: yaml_tree.Node, reader: Reader) -> tuple[Paint | Sett
 def not_a_statement(item: yaml_tree.Mapping, reporter: Reporter, fix: str) -> None:
     message, label = "YAML reads this statement as a mapping", "a `:` at the end of a word makes it a key"
     reporter.error("PD605", message, first_line(item), label, helps=[fix])
-
-
-def _lines(block: Span) -> list[Span]:
-    """The lines of a block that are neither empty nor a comment."""
-    spans, start = [], block.start
-    for line in block.text.splitlines(keepends=True):
-        statement = line.split("#")[0].rstrip()
-        if statement:
-            spans.append(Span(block.source, start, start + len(statement)))
-        start += len(line)
-    return spans
 
 
 def parse_statement(span: Span, reporter: Reporter) -> Paint | Setting | None:

@@ -141,7 +141,11 @@ def shape_of(tree: Syntax, reporter: Reporter) -> Statement | None:
 
 def read_line(line: Span, start: str, reporter: Reporter) -> Syntax | None:
     """The syntax of a line of the language of statements, or None after reporting PD605."""
-    return parse_text(line, start, reporter, _usage(line))
+    word = next(iter(line.text.split(maxsplit=1)), "")
+    usage = (SETTING,) if ":=" in line.text else suggest(word, GENERATOR_STATEMENTS, "statements")
+    if word in GENERATOR_STATEMENTS and ":=" not in line.text:
+        usage = (GENERATOR_STATEMENTS[word],)
+    return parse_text(line, start, reporter, usage)
 
 
 def _numbers(tree: Syntax, parts: Sequence[Syntax], reporter: Reporter) -> tuple[Syntax | None, ...] | None:
@@ -187,16 +191,6 @@ def _without_signs(tree: Syntax) -> Syntax:
         span = Span(tree.span.source, tree.span.start, tree.span.end - 1)
         return Syntax("integer" if span.text.isdigit() else "decimal", (), span.text, span)
     return replace(tree, children=tuple(map(_without_signs, tree.children)))
-
-
-def _usage(line: Span) -> tuple[str, ...]:
-    """The syntax of the statement that begins with the line's first word, or similar words."""
-    if ":=" in line.text:
-        return (SETTING,)
-    word = next(iter(line.text.split(maxsplit=1)), "")
-    if word in GENERATOR_STATEMENTS:
-        return (GENERATOR_STATEMENTS[word],)
-    return suggest(word, GENERATOR_STATEMENTS, "statements")
 
 
 # Amounts
