@@ -267,10 +267,9 @@ class _Cutter:
         outs = [Out(var, self.conjunction(*split[value])) for value, var in vars.items()]
         second = self.needs_of(out.value for out in outs)
         if second:
-            outs = [
-                Out(self.namer.var(FLAG) if value in costly else var, combined("and", split[value][0], graph))
-                for value, var in vars.items()
-            ]
+            names = [self.namer.var(FLAG) if value in costly else var for value, var in vars.items()]
+            firsts = (combined("and", split[value][0], graph) for value in vars)
+            outs = list(map(Out, names, firsts))
         self.emit(Compute(self.computed(outs), place, when=masks.when, over="words"))
         if second:
             flags = [load(graph, out.var) for out in outs]
@@ -381,9 +380,8 @@ class _Cutter:
             needs = [choice.args[0] for choice in chain]
             for choice in chain:
                 needs += self.cell_needs(choice.args[1])
-            return [
-                need for need in (*needs, chain[-1].args[2]) if not self.is_stored(need) and need not in chain
-            ]
+            needs.append(chain[-1].args[2])
+            return [need for need in needs if not self.is_stored(need) and need not in chain]
         return self.cell_needs(node) if of_floats(node) else self.word_needs(node)
 
     def is_recomputed(self, source: Node, reader: Node) -> bool:

@@ -141,10 +141,9 @@ def _with_region(loop: Compute, graph: Graph, slots: Mapping[str, tuple[str]]) -
         numbers, flags = at_rest
         reads = _reads_at_rest(loop.results)
         flags += [graph.node("live", FLAG, (field,), (dy, reach)) for field, dy, reach in reads]
-        rest = [
-            graph.const(bool(number) and out.var.type == FLAG, out.var.type)
-            for out, number in zip(loop.outs, numbers, strict=True)
-        ]
+        types = [out.var.type for out in loop.outs]
+        values = zip(numbers, types, strict=True)
+        rest = [graph.const(bool(number) and type == FLAG, type) for number, type in values]
     outs = tuple(replace(out, otherwise=other) for out, other in zip(loop.outs, rest, strict=True))
     return replace(loop, outs=outs, region=combined("or", dict.fromkeys(flags), graph))
 
@@ -227,9 +226,7 @@ def join(schedule: Schedule) -> Schedule:
         run: list[Compute] = []
         for statement in (*block, None):
             loop = statement if isinstance(statement, Compute) and statement.over != "words" else None
-            if run and (
-                loop is None or _needs_masks_of(loop, run) or keeps_values(loop) or keeps_values(run[-1])
-            ):
+            if run and (loop is None or _ends(run, loop)):
                 result += [_sweeps(loops, reads) for loops in _components(run)]
                 run = []
             if loop is None:
@@ -243,15 +240,16 @@ def join(schedule: Schedule) -> Schedule:
     return map_blocks(schedule, change)
 
 
+def _ends(run: Sequence[Compute], loop: Compute) -> bool:
+    """True if a loop does not join a run; choices are made by flags that must be complete before."""
+    flags = {name for part in run for name, var in part.vars.items() if var.type == FLAG}
+    chooses = loop.over == "choices" and not flags.isdisjoint(loop.reads)
+    return chooses or keeps_values(loop) or keeps_values(run[-1])
+
+
 def keeps_values(loop: Compute) -> bool:
     """True if values outside the region are old ones. Such a loop runs alone, so that rows outside cost nothing."""
     return any(out.otherwise is not None and out.otherwise.op == "load" for out in loop.outs)
-
-
-def _needs_masks_of(loop: Compute, run: Sequence[Compute]) -> bool:
-    """True if choices are made by flags of a run, which must be complete before."""
-    flags = {name for part in run for name, var in part.vars.items() if var.type == FLAG}
-    return loop.over == "choices" and not flags.isdisjoint(loop.reads)
 
 
 def _fuse(first: Compute, second: Compute, reads: Counter[str], graph: Graph) -> Compute | None:

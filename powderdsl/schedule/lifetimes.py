@@ -86,10 +86,10 @@ def _update_in_place(loop: Compute, after: set[str]) -> Compute:
     needed = after | {read.name for read in reads_of(loop.values) if read.far and not read.live}
     olds = Counter(old.attr for old in loop.olds.values() if old.op == "load")
     ended = {name for name, count in olds.items() if count == 1} - needed
-    outs = (
-        replace(out, into=out.otherwise.attr) if out.otherwise and out.otherwise.attr in ended else out
-        for out in loop.outs
-    )
+    outs = []
+    for out in loop.outs:
+        old = out.otherwise.attr if out.otherwise else None
+        outs.append(replace(out, into=old) if old in ended else out)
     return replace(loop, outs=tuple(outs))
 
 
@@ -138,12 +138,9 @@ def _overwrite_fields(sweeps: Sweeps, after: set[str]) -> Sweeps:
     reads = _last_reads(sweeps, after)
     loops = []
     for number, loop in enumerate(sweeps.body):
-        free = [
-            name
-            for name, (least, reader) in reads.items()
-            if least <= loop.lag and reader < number and loop.part == 0
-        ]
-        outs = []
+        free, outs = list[str](), []
+        for name, (least, reader) in reads.items() if loop.part == 0 else ():
+            free += [name] if least <= loop.lag and reader < number else []
         for out in loop.outs:
             lasts = out.var.type == REAL and out.var.name not in sweeps.frees
             into = free.pop(0) if lasts and free else None
@@ -159,11 +156,8 @@ def swap_fields(schedule: Schedule) -> Schedule:
     `swap by m [+1,+0]: …`, `b = settle(m ? a[1,0] : (m[-1,0] ? a[-1,0] : a))` → `swap by m [+1,+0]: b = a`. Moved values of
     a slot stay within its bounds. If some become zero afterwards, a loop over their rows follows.
     """
-    offsets = {
-        statement.region.attr: statement.offset
-        for statement in flat(schedule.body)
-        if isinstance(statement, Move) and statement.op == "swap"
-    }
+    moves = [statement for statement in flat(schedule.body) if isinstance(statement, Move)]
+    offsets = {move.region.attr: move.offset for move in moves if move.op == "swap"}
     if not offsets:
         return schedule
     shifted = planes_at_neighbors(schedule)
@@ -263,19 +257,15 @@ def assign_buffers(schedule: Schedule, homes: Mapping[str, int], pool: Pool, *, 
         result: list[Statement] = []
         for statement in body:
             if isinstance(statement, Guard):
-                pairs = [
-                    (statement.vars[name], old)
-                    for name, old in statement.olds.items()
-                    if old.op != "load" or moves(name, old)
-                ]
+                vars, olds = statement.vars, statement.olds.items()
+                pairs = [(vars[name], old) for name, old in olds if old.op != "load" or moves(name, old)]
                 statement = replace(statement, otherwise=tuple(copies(pairs, graph)))
             elif isinstance(statement, Compute):
                 across = {numbers[name] for name in read_elsewhere(statement.values)}
                 stores_last = any(numbers.get(name) in across for name in statement.vars)
                 moved = any(moves(*pair) for pair in statement.olds.items())
-                statement = replace(
-                    statement, stores_last=stores_last, region=None if moved else statement.region
-                )
+                region = None if moved else statement.region
+                statement = replace(statement, stores_last=stores_last, region=region)
             result.append(statement)
         return tuple(result)
 
@@ -298,9 +288,8 @@ class _Assignment:
 
     def __init__(self, schedule: Schedule, homes: Mapping[str, int], pool: Pool, in_place: bool):
         self.pool, self.in_place = pool, in_place
-        self.buffer: dict[str, Buffer] = {
-            var.name: (var.type.name, homes[slot]) for slot, var in schedule.inputs
-        }
+        inputs = schedule.inputs
+        self.buffer: dict[str, Buffer] = {var.name: (var.type.name, homes[slot]) for slot, var in inputs}
         self.open = {(node.type.name, homes[slot]) for slot, node in schedule.outputs}
         """Buffers of the slots that the pass changes; until its end they may hold other values."""
         self.home_of: dict[str, int] = {}
@@ -431,9 +420,8 @@ def insert_barriers(schedule: Schedule, pending: Pending) -> Schedule:
                 inner = block(statement.body)
                 after, pending.done = pending.done, before
                 statement = replace(statement, body=inner, otherwise=block(statement.otherwise))
-                pending.done |= {
-                    buffer: accesses | pending.done.get(buffer, set()) for buffer, accesses in after.items()
-                }
+                for buffer, done in after.items():
+                    pending.done[buffer] = done | pending.done.get(buffer, set())
             elif isinstance(statement, Compute):
                 words = statement.over == "words"
                 accesses = reads_of(statement.values)

@@ -102,11 +102,8 @@ def _values_of(body: Iterable[Statement]) -> dict[str, Node]:
 def _preserves_counts(guard: Guard, bits: Container[str]) -> bool:
     """True if a guard preserves the count of each element: it swaps cells, or writes no elements."""
     values = _values_of(guard.body)
-    return all(
-        values[name].op == "swap" and values[name].args[0] is old is values[name].args[2]
-        for name, old in guard.olds.items()
-        if name in bits
-    )
+    pairs = [(values[name], old) for name, old in guard.olds.items() if name in bits]
+    return all(value.op == "swap" and value.args[0] is old is value.args[2] for value, old in pairs)
 
 
 def _pass_condition(schedule: Schedule, bits: dict[str, int]) -> Node | None:

@@ -83,10 +83,8 @@ def rows_of(sweeps: Sweeps, reaches: Mapping[str, int]) -> Rows:
         marked = [] if chains else [name for name in planes if name not in sweeps.vars]
         loops.append(RowLoop(loop, tuple(marked), tuple(map(tuple, chains)), turned))
         turned += -(-len(loops[-1].masks) // TURNED) * TURNED
-    first = sweeps.body[0]
-    places = (
-        {out.into: out.var.name for out in first.outs if out.into is not None} if keeps_values(first) else {}
-    )
+    kept = sweeps.body[0].outs if keeps_values(sweeps.body[0]) else ()
+    places = {out.into: out.var.name for out in kept if out.into is not None}
     return Rows(tuple(loops), rings, saved, waiting, turned, places, reaches)
 
 

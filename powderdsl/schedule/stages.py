@@ -144,9 +144,8 @@ class _Lowering:
             when = self.graph.node("some", ANSWER, tuple(map(self.value, guards)))
             self.compute(guarded, step.place)
             body = self.body.pop()
-            outs = tuple(
-                Out(var, old, old) for var, old in zip(body.vars.values(), guarded.values(), strict=True)
-            )
+            olds = zip(body.vars.values(), guarded.values(), strict=True)
+            outs = tuple(Out(var, old, old) for var, old in olds)
             self.body.append(Guard(outs, step.place, when=when, body=(body,)))
         self.current |= dict(step.writes)
 

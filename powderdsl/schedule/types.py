@@ -106,13 +106,11 @@ class Statement:
 
     def with_values(self, new: Callable[[Node], Node]) -> Self:
         """The statement with each of its values replaced by another."""
-        outs = [
-            replace(out, value=new(out.value), otherwise=out.otherwise and new(out.otherwise))
-            for out in self.outs
-        ]
-        return replace(
-            self, outs=tuple(outs), region=self.region and new(self.region), when=self.when and new(self.when)
-        )
+        outs = []
+        for out in self.outs:
+            outs.append(replace(out, value=new(out.value), otherwise=out.otherwise and new(out.otherwise)))
+        region, when = self.region and new(self.region), self.when and new(self.when)
+        return replace(self, outs=tuple(outs), region=region, when=when)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -347,12 +345,11 @@ def variables(schedule: Schedule) -> dict[str, Var]:
 def map_blocks(schedule: Schedule, change: Callable[[Block], Block]) -> Schedule:
     """The schedule with every block of statements changed, inner blocks first."""
 
+    def inner(part: Statement) -> Statement:
+        return replace(part, body=block(part.body), otherwise=block(part.otherwise)) if part.body else part
+
     def block(body: Block) -> Block:
-        inner = [
-            replace(part, body=block(part.body), otherwise=block(part.otherwise)) if part.body else part
-            for part in body
-        ]
-        return change(tuple(inner))
+        return change(tuple(map(inner, body)))
 
     return replace(schedule, body=block(schedule.body))
 
@@ -374,11 +371,7 @@ def map_each(schedule: Schedule, kind: type[Kind], change: Callable[[Kind], Iter
 
 def map_values(schedule: Schedule, rule: Rule) -> Schedule:
     """The schedule with every value rewritten by a rule, see `rewritten`."""
-    return with_values(schedule, rewritten(schedule.values, schedule.graph, rule))
-
-
-def with_values(schedule: Schedule, new: Callable[[Node], Node]) -> Schedule:
-    """The schedule with every value replaced by another."""
+    new = rewritten(schedule.values, schedule.graph, rule)
     changed = map_each(schedule, Statement, lambda statement: [statement.with_values(new)])
     return replace(changed, outputs=tuple((slot, new(node)) for slot, node in schedule.outputs))
 

@@ -42,11 +42,8 @@ class Ramp:
 
 
 def ramps(elements: Sequence[Element]) -> tuple[Ramp, ...]:
-    return tuple(
-        Ramp(element.id, element.ramp.field, *_steps(element.ramp))
-        for element in sorted(elements, key=lambda element: element.id)
-        if element.ramp is not None
-    )
+    followed = sorted((element.id, element.ramp) for element in elements if element.ramp is not None)
+    return tuple(Ramp(id, ramp.field, *_steps(ramp)) for id, ramp in followed)
 
 
 @dataclass(frozen=True)
@@ -63,9 +60,8 @@ def tints(fields: Sequence[Field]) -> tuple[CellTint, ...]:
     tints = []
     for field in fields:
         if (tint := field.tint) is not None:
-            red, green, blue, _ = (
-                float(np.float32(part) / np.float32(255)) for part in _components(tint.color)
-            )
+            parts = _components(tint.color)
+            red, green, blue, _ = (float(np.float32(part) / np.float32(255)) for part in parts)
             most = float(np.float32(tint.most))
             tints.append(CellTint(field.name, (red, green, blue), float(tint.full), most))
     return tuple(tints)

@@ -108,11 +108,10 @@ class ByWidth:
         recall, compile = partial(self._recall, width), partial(self._compile, width)
         with building(self._how):
             try:
-                program = (
-                    AutoProgram(*self._first, self._cells, recall, compile)
-                    if self._first is not None
-                    else recall() or compile()
-                )
+                if self._first is not None:
+                    program: Runnable = AutoProgram(*self._first, self._cells, recall, compile)
+                else:
+                    program = recall() or compile()
             except NoCompiler as error:
                 raise _refusal(error) from None
             return self._programs.setdefault(width, program)
@@ -280,6 +279,5 @@ class AutoProgram:
 def _warn_of_compilers(problem: str) -> None:
     """Warn once a process if work is worth compiling and there is no compiler. Other problems appear in `notes`."""
     if problem.startswith(MISSING):
-        warnings.warn(
-            f"{problem}; native code is many times faster: {INSTALL}", NoCompilerWarning, stacklevel=2
-        )
+        message = f"{problem}; native code is many times faster: {INSTALL}"
+        warnings.warn(message, NoCompilerWarning, stacklevel=2)

@@ -150,9 +150,8 @@ class Observer:
     @property
     def plane_names(self) -> tuple[str, ...]:
         """The names of the planes: a flag's name, or ``name:bit`` for integers."""
-        return tuple(
-            name if self.slots[name].kind.name == "flag" else f"{name}:{bit}" for name, bit in self._bits
-        )
+        flags = {slot.name for slot in self.slots.values() if slot.kind.name == "flag"}
+        return tuple(name if name in flags else f"{name}:{bit}" for name, bit in self._bits)
 
     @cached_property
     def _coded(self) -> tuple[tuple[str, Slot], ...]:
@@ -173,12 +172,9 @@ class Observer:
 
     @cached_property
     def _looks(self) -> dict[str, Any]:
-        shown, on_device = looks(self.ruleset.elements, self.ruleset.fields), Tensors(self.device).from_numpy
-        ramps = [
-            replace(ramp, starts=on_device(ramp.starts), colors=on_device(ramp.colors))
-            for ramp in shown["ramps"]
-        ]
-        return {**shown, "colors": on_device(shown["colors"]), "ramps": ramps}
+        shown, put = looks(self.ruleset.elements, self.ruleset.fields), Tensors(self.device).from_numpy
+        ramps = [replace(ramp, starts=put(ramp.starts), colors=put(ramp.colors)) for ramp in shown["ramps"]]
+        return {**shown, "colors": put(shown["colors"]), "ramps": ramps}
 
     @cached_property
     def _channels(self) -> tuple[tuple[Channel, ...], Tensor]:
@@ -207,15 +203,11 @@ class Observer:
         if not isinstance(out, Tensor):
             raise TypeError(f"out must be a torch tensor, found {type(out).__name__}")
         if (tuple(out.shape), out.dtype, out.device) != (shape, dtype, self.device):
-            wanted, actual = (
-                f"{dtype} {list(shape)} on {self.device}",
-                f"{out.dtype} {list(out.shape)} on {out.device}",
-            )
-            raise ValueError(f"out must be {wanted}, found {actual}")
+            found = f"{out.dtype} {list(out.shape)} on {out.device}"
+            raise ValueError(f"out must be {dtype} {list(shape)} on {self.device}, found {found}")
         if shape[0] and not (out[0].is_contiguous() and (shape[0] == 1 or out.stride(0) >= out[0].numel())):
-            raise ValueError(
-                f"each world of out must be contiguous, and worlds apart; found the strides {list(out.stride())}"
-            )
+            rule = "each world of out must be contiguous, and worlds apart"
+            raise ValueError(f"{rule}; found the strides {list(out.stride())}")
         return out
 
 

@@ -55,9 +55,8 @@ def array_kind(backend: str, device: Any, tensors: bool) -> ArrayKind:
     if backend not in (*WITHOUT_TORCH, "auto"):
         raise unavailable(backend, "torch or NumPy is not installed", _CPU)
     if str(device) != "cpu":
-        raise failure(
-            "PD701", f"no device `{device}`", notes=("torch or NumPy is not installed",), helps=(_CPU,)
-        )
+        notes = ("torch or NumPy is not installed",)
+        raise failure("PD701", f"no device `{device}`", notes=notes, helps=(_CPU,))
     return ArrayKind()
 
 
@@ -106,29 +105,22 @@ def make_program(
         return BackendProgram("reference", ReferenceProgram(ruleset, kind))
     if backend in ("wasm", "native") and not kind.on_cpu:
         runs = {"wasm": "wasmtime", "native": "native code"}[backend]
-        raise unavailable(
-            backend,
-            f"{runs} runs on the CPU",
-            f"run on the device `cpu`, or on the backend `torch` or `auto` on `{device}`",
-        )
+        fix = f"run on the device `cpu`, or on the backend `torch` or `auto` on `{device}`"
+        raise unavailable(backend, f"{runs} runs on the CPU", fix)
     if backend == "wasm" and problem:
         raise unavailable("wasm", problem, _CPU if plain else _WASMTIME)
     if plain:
-        return BackendProgram(
-            "wasm", _plain_program(ruleset, kind, memo), lambda: ReferenceProgram(ruleset, kind)
-        )
+        oracle = partial(ReferenceProgram, ruleset, kind)
+        return BackendProgram("wasm", _plain_program(ruleset, kind, memo), oracle)
     from powderdsl.targets.torch.packed import PlanesProgram
     from powderdsl.targets.torch.program import TorchProgram, packed_program
 
     # Made on first use: native code that was compiled before needs none of them.
     lowered, segments = cache(lambda: lower(ruleset)), cache(lambda: segments_of(ruleset))
-    cells = cache(lambda: TorchProgram(lowered(), device))
-
+    cells, fuse = cache(lambda: TorchProgram(lowered(), device)), backend == "torch-fused"
+    make = partial(PlanesProgram, device=device, fuse=fuse)
+    torch = cache(lambda: packed_program(segments(), device, make))
     wasm = cache(lambda: packed_program(segments(), device, partial(WasmProgram, kind=kind)))
-    fuse = backend == "torch-fused"
-    torch = cache(
-        lambda: packed_program(segments(), device, partial(PlanesProgram, device=device, fuse=fuse))
-    )
     if backend == "wasm":
         return BackendProgram("wasm", wasm(), cells)
     if backend == "native" or (backend == "auto" and kind.on_cpu):
@@ -211,9 +203,7 @@ class ReferenceProgram:
         draws = {name: (host(value) + 0.5) / 2.0 ** self._bits[name] for name, value in job.draws.items()}
         passes = self._passes if job.passes is None else job.passes
         for i in range(job.steps):
-            at = reference.Clock(seed, index, start + i)
+            at, rules = reference.Clock(seed, index, start + i), self._ruleset
             job.tick("")
-            arrays = reference.step(
-                self._ruleset, arrays, at, numbers, passes=passes, draws=draws, tick=job.tick
-            )
+            arrays = reference.step(rules, arrays, at, numbers, passes=passes, draws=draws, tick=job.tick)
         return {name: self._kind.from_numpy(value.copy()) for name, value in arrays.items()}

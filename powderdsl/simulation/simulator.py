@@ -76,9 +76,8 @@ class World:
             array = getattr(self, name)
             fits = tuple(array.shape) == (batch,) and array.dtype == self.sim.kind.xp.int64
             if not fits or getattr(array, "device", None) != device:
-                raise ValueError(
-                    f"a world's {name} must be int64 [{batch}], found {array.dtype} {list(array.shape)}"
-                )
+                found = f"{array.dtype} {list(array.shape)}"
+                raise ValueError(f"a world's {name} must be int64 [{batch}], found {found}")
 
     def __repr__(self) -> str:
         worlds, rows, columns = self.shape
@@ -330,13 +329,9 @@ class Simulator:
         seeds = self._integers(seed, "seed")
         if index is None:
             index = range(batch) if seeds.ndim == 0 else [0] * batch
-        return World(
-            self,
-            {name: self._fresh(slot, element) for name, slot in self.slot_by_name.items()},
-            self.numbers(seeds, "seed", batch),
-            self.numbers(index, "index", batch),
-            self.kind.put([0] * batch, "int64"),
-        )
+        state = {name: self._fresh(slot, element) for name, slot in self.slot_by_name.items()}
+        clock = self.numbers(seeds, "seed", batch), self.numbers(index, "index", batch)
+        return World(self, state, *clock, self.kind.put([0] * batch, "int64"))
 
     def _fresh(self, slot: Slot, ids: Array) -> Array:
         """A slot's values in new cells of these elements."""
@@ -345,12 +340,11 @@ class Simulator:
 
     def _renew(self, state: Mapping[str, Array], ids: Array, cells: Array) -> dict[str, Array]:
         """A state with fresh cells of the elements `ids`, uint8 [B, H, W], where `cells` is set."""
-        return {
-            name: self._where(slot, cells, self._fresh(slot, ids), state[name])
-            if slot.travels
-            else state[name]
-            for name, slot in self.slot_by_name.items()
-        }
+        new = dict(state)
+        for name, slot in self.slot_by_name.items():
+            if slot.travels:
+                new[name] = self._where(slot, cells, self._fresh(slot, ids), state[name])
+        return new
 
     def _where(self, slot: Slot, cells: Array, yes: Array, no: Array) -> Array:
         """The values of a slot, by cells bool [B, H, W]."""
@@ -374,9 +368,8 @@ class Simulator:
         if array.ndim == 0:
             array = xp.broadcast_to(array, (batch,))
         if tuple(array.shape) != (batch,) or bool((array < 0).any()):
-            raise ValueError(
-                f"{name} must be one number of 0 or more, or {batch} of them, found shape {list(array.shape)}"
-            )
+            rule = f"{name} must be one number of 0 or more, or {batch} of them"
+            raise ValueError(f"{rule}, found shape {list(array.shape)}")
         return self.kind.copied(array)
 
     # Changing worlds
@@ -425,9 +418,8 @@ class Simulator:
         try:
             return self.kind.xp.broadcast_to(array, target)
         except (RuntimeError, ValueError):
-            raise ValueError(
-                f"{name} must have the shape {list(target)}, found {list(array.shape)}"
-            ) from None
+            found = list(array.shape)
+            raise ValueError(f"{name} must have the shape {list(target)}, found {found}") from None
 
     def paint(self, world: World, /, *, where: Any, element: str | None = None, **fields: Any) -> World:
         """Set cells of a mask: fresh cells of an element, and values of fields.

@@ -18,7 +18,7 @@ from powderdsl.model.state import (
     storage,
     stored_range,
 )
-from powderdsl.model.types import Param, Ruleset
+from powderdsl.model.types import Ruleset
 from powderdsl.system.cache import Memo
 from powderdsl.system.writing import failure
 from powderdsl.targets.layout import Piece, pieces
@@ -62,9 +62,13 @@ def standalone_module(ruleset: Ruleset, size: tuple[int, int], memo: Memo | None
     (element,) = parts_of["element"]
     fields = tuple(_stored(slot, ruleset, parts_of[slot.name]) for slot in slots(ruleset)[1:])
     ids = tuple(sorted(element.id for element in ruleset.elements))
-    knobs = tuple(map(_knob, ruleset.params))
+    knobs = []
+    for param in ruleset.params:
+        low, high = map(float, stored_range(param.kind))
+        whole = param.kind.name in ("int", "flag")
+        knobs.append(Knob(param.name, float(param.default), low, high, whole))
     about = json.dumps(_about(ruleset, size, knobs), separators=(",", ":"), ensure_ascii=False).encode()
-    face = Face(size[0], ids, element, fields, knobs, about)
+    face = Face(size[0], ids, element, fields, tuple(knobs), about)
     return wasm_module(segments[0].planes, size[1], face=face, memo=memo).code
 
 
@@ -85,11 +89,6 @@ def _stored(slot: Slot, ruleset: Ruleset, parts: tuple[Piece, ...]) -> Stored:
         slot.travels,
         slot.kind.name == "element",
     )
-
-
-def _knob(param: Param) -> Knob:
-    low, high = map(float, stored_range(param.kind))
-    return Knob(param.name, float(param.default), low, high, param.kind.name in ("int", "flag"))
 
 
 def _about(ruleset: Ruleset, size: tuple[int, int], knobs: Sequence[Knob]) -> dict[str, Any]:

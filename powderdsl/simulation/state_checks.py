@@ -31,9 +31,8 @@ def unknown_slot(ruleset: Ruleset, name: str) -> KeyError:
     if ruleset.element(name) is not None:
         return KeyError(f"`{name}` is an element, not a field: world.count({name!r}) counts its cells")
     known = [*(slot.name for slot in slots(ruleset)), *(prop.name for prop in ruleset.properties)]
-    return KeyError(
-        with_suggestion(f"{ruleset.name} has no field or property `{name}`", name, known, "it has")
-    )
+    message = f"{ruleset.name} has no field or property `{name}`"
+    return KeyError(with_suggestion(message, name, known, "it has"))
 
 
 def check_ids(kind: ArrayKind, ids: Array, name: str, ruleset: Ruleset) -> None:

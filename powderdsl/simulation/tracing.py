@@ -84,13 +84,12 @@ class NumberedRule:
 
 def numbered_rules(ruleset: Ruleset) -> tuple[NumberedRule, ...]:
     """All rules in the order in which they run; rule number n is at index n − 1."""
-    numbers = count(1)
-    return tuple(
-        NumberedRule(next(numbers), pass_.pack, pass_.name, position, moment.label, rule)
-        for pass_ in ruleset.passes
-        for position, moment in enumerate(pass_.moments, 1)
-        for rule in moment.rules
-    )
+    rules: list[NumberedRule] = []
+    for pass_ in ruleset.passes:
+        for position, moment in enumerate(pass_.moments, 1):
+            where = pass_.pack, pass_.name, position, moment.label
+            rules += [NumberedRule(i, *where, rule) for i, rule in enumerate(moment.rules, len(rules) + 1)]
+    return tuple(rules)
 
 
 # Substeps and writes
@@ -209,9 +208,8 @@ class RecordedStep:
             if not mask[(0, *self.cell)]:
                 return
             substep = self.substeps[-1]
-            attempt = Attempt(
-                substep.rules[id(change.rule)], substep, substep.neighbor_of(self.cell, change.origin)
-            )
+            asked = substep.neighbor_of(self.cell, change.origin)
+            attempt = Attempt(substep.rules[id(change.rule)], substep, asked)
             source = None if change.source is None else substep.neighbor_of(self.cell, change.source)
         old, new = pick(before, self.cell), pick(after, self.cell)
         write = Write(change.slot, old, new, change.how, attempt, source)
@@ -313,16 +311,10 @@ def _read(expr: Expr, substep: Substep, place: Cell, offset: Offset) -> Read:
             inside = there == (place[0] + dy, place[1] + dx)
             if weight and (inside or kernel.wrap) and pick(holds, there):
                 counted.append(there)
-    return Read(
-        show_offset(offset)
-        if away and expr.op == "element"
-        else _written(show_expr(ruleset, look(expr, offset))),
-        plain(ruleset, expr.kind, value),
-        show_at_cell(ruleset, expr.kind, value),
-        None if expr.op in ("param", "coordinate") else place,
-        element,
-        tuple(counted),
-    )
+    shown = plain(ruleset, expr.kind, value), show_at_cell(ruleset, expr.kind, value)
+    text = show_offset(offset) if away and expr.op == "element" else show_expr(ruleset, look(expr, offset))
+    where = None if expr.op in ("param", "coordinate") else place
+    return Read(_written(text), *shown, where, element, tuple(counted))
 
 
 def _written(name: str) -> str:
@@ -420,11 +412,9 @@ def trace(
     if not every_rule:
         lines = {_line(write.attempt.rule) for write in writes if write.attempt}
         misses = tuple(miss for miss in misses if _line(miss.rule) not in lines)
-    changes = tuple(
-        Change(slot, *(pick(state[name], cell) for state in (recorded.begin, recorded.end)))
-        for name, slot in slots.items()
-        if name in recorded.end
-    )
+    begin, end = recorded.begin, recorded.end
+    names = [name for name in slots if name in end]
+    changes = tuple(Change(slots[name], pick(begin[name], cell), pick(end[name], cell)) for name in names)
     return Trace(world.sim.ruleset, number, cell, int(alone.step[0]) + step, changes, writes, misses)
 
 
@@ -706,10 +696,8 @@ def _with_rule_marks(ruleset: Ruleset) -> Ruleset:
                 number, writes = next(numbers), _element_writes(rule)
                 mark = Expr("const", integer(number, number), value=number)
                 if moment.policy in ("prove", "overwrite"):  # all rules happen where their conditions hold
-                    late += [
-                        (arrives, Assign(SLOT, at, ":=", mark, rule.mask, rule.span))
-                        for arrives, at in writes
-                    ]
+                    for arrives, at in writes:
+                        late.append((arrives, Assign(SLOT, at, ":=", mark, rule.mask, rule.span)))
                 elif not isinstance(rule, Assign):  # of the cells that rules claim each has one writer
                     marks = (Assign(SLOT, at, ":=", mark, TRUE, rule.span) for _, at in writes)
                     rules[place] = replace(rule, effects=(*rule.effects, *marks))
