@@ -113,9 +113,8 @@ class OwnedBatch(PackedArrays):
     def handle(self) -> int:
         """The batch, for the backend. Raises RuntimeError after `take`."""
         if self._handle is None:
-            raise RuntimeError(
-                "these worlds were stepped with `reuse`: only those that came of it can be used"
-            )
+            problem = "these worlds were stepped with `reuse`"
+            raise RuntimeError(f"{problem}: only those that came of it can be used")
         return self._handle
 
     def take(self) -> int:
@@ -182,7 +181,6 @@ class Runnable(Protocol):
 
     def run(self, job: Job) -> Mapping[str, Array]:
         """The state `job.steps` later."""
-        ...
 
 
 class MixedProgram:
@@ -195,10 +193,9 @@ class MixedProgram:
         """The state `job.steps` later."""
         clock, state = job.clock, job.state
         for i in range(job.steps):
+            now = clock._replace(since=clock.since + i)
             for part in self.parts:
-                state = part.run(
-                    job._replace(state=state, clock=clock._replace(since=clock.since + i), steps=1)
-                )
+                state = part.run(job._replace(state=state, clock=now, steps=1))
         return state
 
 

@@ -77,10 +77,8 @@ def parameters(
     views: dict[tuple[str, Threshold | None], Any] = {}
     for (name, threshold, bit), number in planes.items():
         if (name, threshold) not in views:
-            value = params[name]
-            views[name, threshold] = (
-                xp.asarray(value, dtype=xp.int64) if threshold is None else limits(xp, value, threshold)
-            )
+            value = params[name] if threshold is None else limits(xp, params[name], threshold)
+            views[name, threshold] = xp.asarray(value, dtype=xp.int64)
         bits[number] = (views[name, threshold] >> bit) & 1
     floats = xp.zeros((max(1, len(reals)), batch), dtype=xp.float32, **where)
     for name, number in reals.items():

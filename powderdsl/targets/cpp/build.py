@@ -20,6 +20,7 @@ from functools import lru_cache
 from importlib.util import find_spec
 from pathlib import Path
 from tempfile import TemporaryFile
+from typing import Any
 
 # Imported here, not later: a fork while another thread imports it would leave the child waiting forever.
 from filelock import FileLock, Timeout
@@ -58,10 +59,9 @@ def find_compiler() -> Compiler:
     Raises NoCompiler if none works. If `$CXX` is set, no other compiler is tried.
     """
     cxx = os.environ.get("CXX", "").strip()
+    candidates: list[tuple[str, ...]] = [("g++",), ("c++",), ("clang++",)]
     try:
-        candidates: list[tuple[str, ...]] = (
-            [tuple(shlex.split(cxx))] if cxx else [("g++",), ("c++",), ("clang++",)]
-        )
+        candidates = [tuple(shlex.split(cxx))] if cxx else candidates
     except ValueError as error:
         raise NoCompiler(f"{MISSING}: $CXX is `{cxx}`: {error}") from None
     package = None if cxx else find_spec("ziglang")
@@ -82,10 +82,9 @@ def find_compiler() -> Compiler:
 @lru_cache(maxsize=8)
 def _version(command: tuple[str, ...], program: str) -> str:
     """The first line of `--version`; empty if the command, which is this program, does not run."""
+    nothing = subprocess.DEVNULL
     try:
-        output = subprocess.check_output(
-            [*command, "--version"], stdin=subprocess.DEVNULL, stderr=subprocess.DEVNULL, timeout=30
-        )
+        output = subprocess.check_output([*command, "--version"], stdin=nothing, stderr=nothing, timeout=30)
     except (OSError, subprocess.SubprocessError):
         return ""
     return (output.decode(errors="replace").strip().splitlines() or ["unknown"])[0]
@@ -245,20 +244,18 @@ def run_compilers(scratch: Path, *commands: list[str]) -> tuple[int, str]:
 
     `scratch` is a folder for temporary files. Raises NoCompiler if one cannot be started, or takes longer than TIMEOUT.
     """
-    environment = {**os.environ, "TMPDIR": str(scratch), "LC_ALL": "C"}
     processes: list[subprocess.Popen[bytes]] = []
     with TemporaryFile() as messages:
+        # In new sessions, so that the programs that g++ starts end with it.
+        options: dict[str, Any] = {
+            "stdin": subprocess.DEVNULL,
+            "stdout": subprocess.DEVNULL,
+            "stderr": messages,
+        }
+        options |= {"env": {**os.environ, "TMPDIR": str(scratch), "LC_ALL": "C"}, "start_new_session": True}
         try:
             for command in commands:
-                # In a new session, so that the programs that g++ starts end with it.
-                process = subprocess.Popen(
-                    command,
-                    stdin=subprocess.DEVNULL,
-                    stdout=subprocess.DEVNULL,
-                    stderr=messages,
-                    env=environment,
-                    start_new_session=True,
-                )
+                process = subprocess.Popen(command, **options)
                 processes.append(process)
                 _running.append(process)
             # Without a limit, waiting holds a lock, and a forked child would wait for the compilers too.

@@ -14,9 +14,7 @@ from powderdsl.targets.printing import CellValues
 AT_ONCE = 4
 """Choices that are skipped together: a branch for each choice would be hard to predict."""
 
-PLACE = (
-    "const int lane = strips ? y / height : l, row = strips ? y - lane * height : y; (void)lane; (void)row;"
-)
+PLACE = "const int lane = strips ? y / height : l, row = strips ? y - lane * height : y; (void)lane; (void)row;"  # fmt: skip
 """The lane and the row of planes that contain the words of row y."""
 
 _FLOATS = {
@@ -44,10 +42,8 @@ def sweeps_text(sweeps: Sweeps, layout: NativeLayout, reaches: Mapping[str, int]
     if keeps_values(sweeps.body[0]):
         return _in_place(loops[0])
     layout.cover(turned=rows.turned, waiting=rows.waiting)
-    pointers = " ".join(
-        f"const float* at{name}[{ring.depth}]; std::fill_n(at{name}, {ring.depth}, nothing);"
-        for name, ring in rows.rings.items()
-    )
+    depths = [(name, ring.depth) for name, ring in rows.rings.items()]
+    pointers = " ".join(f"const float* at{n}[{d}]; std::fill_n(at{n}, {d}, nothing);" for n, d in depths)
     for name, (count, first) in rows.saved.items():
         pointers += f" KEEP_FIRST({name}, {count}, {first})"
     lines = [line for loop in loops for line in loop.before()]
@@ -69,11 +65,10 @@ def sweeps_text(sweeps: Sweeps, layout: NativeLayout, reaches: Mapping[str, int]
     text = "\n".join(["[&]() __attribute__((noinline)) {", *lines, "}();"])
     if any(loop.region is None for loop in sweeps.body):
         return f"{{\n{text}\n}}"
-    lasting = [(out.var.name, out.otherwise, out.into) for out in rows.outs if out.var.name not in rows.rings]
-    quiet = " ".join(
-        f"{name} = keep({storage_of(value)});" for name, value, _ in lasting if value is not None
-    )
-    quiet += " ".join(f" give(c, {old});" for _, _, old in lasting if old is not None)
+    lasting = [out for out in rows.outs if out.var.name not in rows.rings]
+    olds = [(out.var.name, out.otherwise) for out in lasting if out.otherwise is not None]
+    quiet = " ".join(f"{name} = keep({storage_of(value)});" for name, value in olds)
+    quiet += " ".join(f" give(c, {out.into});" for out in lasting if out.into is not None)
     return f"if ({' && '.join(_nothing(rows)) or 'true'}) {{ {quiet} }} else {{\n{text}\n}}"
 
 
@@ -100,13 +95,8 @@ def _addresses(rows: Rows) -> str:
     loads = {str(node.attr): node.type for node in ordered(values) if node.op == "load"}
     types = {rows.places.get(name, name): type for name, type in loads.items()}
     types |= {out.var.name: out.var.type for out in rows.outs}
-    return " ".join(
-        f"const Field v{name} = *{name}; (void)v{name};"
-        if type == REAL
-        else f"V* const v{name} = {name}->data; (void)v{name};"
-        for name, type in types.items()
-        if name not in rows.rings
-    )
+    forms = {True: "const Field v{0} = *{0}; (void)v{0};", False: "V* const v{0} = {0}->data; (void)v{0};"}
+    return " ".join(forms[types[name] == REAL].format(name) for name in types if name not in rows.rings)
 
 
 def _nothing(rows: Rows) -> list[str]:
@@ -232,29 +222,23 @@ class _Loop(CellValues[str]):
             if name not in self.rows.rings:
                 counts.append(f"I n{name} = {{}};")
                 stores.append(f"n{name} |= (I)blend(inside, {value}, splatf(0));")
-                lives.append(
-                    f"{{ const bool some = any((V)(n{name} + n{name})); v{name}.live[base + y] = some; some{name} |= some; }}"
-                )
+                live = f"const bool some = any((V)(n{name} + n{name}));"
+                lives.append(f"{{ {live} v{name}.live[base + y] = some; some{name} |= some; }}")
         yield PLACE
         if self.plan.loop.region is not None:
             fields, planes = region_of(self.plan.loop)
             marked = self.plan.marked
             tests = [self.is_row_live(field) for field in fields]
             tests += [f"(c.marks[{self.number} * height + row] >> lane & 1)"] if marked else []
-            scans = [
-                f"some |= row_bits(v{name}, row * words, words, lane);"
-                for name in planes
-                if name not in marked
-            ]
+            rest = [name for name in planes if name not in marked]
+            scans = [f"some |= row_bits(v{name}, row * words, words, lane);" for name in rest]
             busy = " || ".join(tests) or "false"
             yield f"Word some = {busy};" + (f" if (!some) {{ {' '.join(scans)} }}" if scans else "")
             yield f"if (!some) {{ {' '.join(self.row_outside_region())} }} else {{"
         yield " ".join([*self.rows_read(), *self.starts(), *counts])
         yield from (f"if (!WIDTH) o{name}[(words - 1) * LANES] = 0;" for name in self.flags)
-        words = [
-            f"const Word {name} = lane_word(v{plane}, row * words + w, lane);"
-            for plane, name in self.words.items()
-        ]
+        word = "const Word {} = lane_word(v{}, row * words + w, lane);"
+        words = [word.format(name, plane) for plane, name in self.words.items()]
         yield f"for (int w = 0; w < words; w++) {{ {' '.join(words)}"
         yield "EACH_CHUNK { const u32 inside = inside_of(x, width); (void)inside;"
         yield from (*self.lines, *stores)
@@ -280,13 +264,9 @@ class _Loop(CellValues[str]):
             olds = (id(choice.args[2]) for choice in choices)
             with self.inner(dict(zip(olds, heads, strict=True))) as lines:
                 values = [self.of(choice.args[1]) for choice in choices]
-            lines += [
-                f"{head} = blend(bits, {value}, {head});" for head, value in zip(heads, values, strict=True)
-            ]
-            levels.append(
-                f"{{ const Word m = masks[{level}]; "
-                f"EACH_REGISTER {{ const u32 bits = m >> (x & (BITS - 1)) & ALL; {' '.join(lines)} }} }}"
-            )
+            lines += map("{0} = blend(bits, {1}, {0});".format, heads, values)
+            bits = f"const u32 bits = m >> (x & (BITS - 1)) & ALL; {' '.join(lines)}"
+            levels.append(f"{{ const Word m = masks[{level}]; EACH_REGISTER {{ {bits} }} }}")
         with self.inner({id(chain[-1]): head for chain, head in zip(chains, heads, strict=True)}) as ends:
             stores = [f"*(F*)(o{out.var.name} + x) = {self.of(out.value)};" for out in self.outs]
         ends += stores
@@ -302,9 +282,8 @@ class _Loop(CellValues[str]):
         moves = all(node.op in ("shift", "load") or is_zero(node) for node in chosen)
         near = " || ".join(f"{name} != nothing" for name in self.pointers.values()) if moves else "true"
         yield f"const bool some = any ? {near} : {' || '.join(lives)};"
-        yield " ".join(
-            f"some{out.var.name} |= v{out.var.name}.live[base + y] = some;" for out in self.lasting
-        )
+        names = [out.var.name for out in self.lasting]
+        yield " ".join(map("some{0} |= v{0}.live[base + y] = some;".format, names))
         yield f"if (!some) {{ {self.forget_rings()} }} else {{"
         yield " ".join(self.starts())
         yield f"for (int w = 0; w < words; w++) {{ const Word* masks = turned + w * c.masks; const u64 which = which_turned(masks, {count});"
@@ -407,9 +386,7 @@ class _Loop(CellValues[str]):
         bits = self.fresh("b")
         with self.inner() as lines:
             texts = [self.of(value) for value in values]
-        lines += [
-            f"{name} = blend({bits}, {text}, {name});" for name, text in zip(variables, texts, strict=True)
-        ]
+        lines += map(f"{{0}} = blend({bits}, {{1}}, {{0}});".format, variables, texts)
         self.lines.append(f"if (const u32 {bits} = {self.mask(mask)}) {{ {' '.join(lines)} }}")
 
 

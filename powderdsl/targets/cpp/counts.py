@@ -92,8 +92,6 @@ class CellCounts:
         """The numbers in each world of a batch in native memory: float64 [B, n]."""
         gates, counts = self._sizes
         numbers = torch.empty(worlds, counts, dtype=torch.float64)
-        masks = self.masks.data_ptr()
-        library.pd_count(
-            handle, gates, self._gates, counts, self._counts, *self._rows, masks, numbers.data_ptr()
-        )
+        ends = (*self._rows, self.masks.data_ptr(), numbers.data_ptr())
+        library.pd_count(handle, gates, self._gates, counts, self._counts, *ends)
         return numbers

@@ -65,9 +65,7 @@ def native_source(program: Program, width: int = 0) -> NativeSource:
         "COINS": len(layout.coins),
         "REALS": len(layout.reals),
     }
-    for name, size in vars(layout).items():
-        if isinstance(size, int):
-            sizes[name.upper()] = size
+    sizes |= {name.upper(): size for name, size in vars(layout).items() if isinstance(size, int)}
     sizes |= {"SNAP": literal(SNAP), "PASSES": len(passes)}
     before, after = "\n".join(map(_header, LIBRARY)), "\n".join(map(_header, DRIVER))
     units = 2 if sum(map(len, passes)) >= UNIT_SIZE else 1
@@ -93,7 +91,7 @@ def _header(name: str) -> str:
 
 def _tables(program: Program, layout: NativeLayout, tested: int) -> Iterator[str]:
     """Tables of the slots that a step resets, of planes and of streams; the ids whose presence passes test."""
-    planes, reals, idents, elements = [], [], [], []
+    planes, reals, elements = [], [], []
     for slot in program.slots:
         if slot.name.startswith(ELEMENT):
             elements.append(layout.planes[slot.name])
@@ -101,8 +99,7 @@ def _tables(program: Program, layout: NativeLayout, tested: int) -> Iterator[str
             planes.append((layout.planes[slot.name], int(slot.default)))
         elif slot.resets:
             reals.append((layout.reals[slot.name], literal(float(slot.default))))
-    for _, ident, _ in program.streams:
-        idents.append(f"{ident}u")
+    idents = [f"{ident}u" for _, ident, _ in program.streams]
     yield f"static const std::vector<ResetPlane> RESET_PLANES = {braced(map(braced, planes))};"
     yield f"static const std::vector<ResetReal> RESET_REALS = {braced(map(braced, reals))};"
     yield f"static const std::vector<FixedPlane> FIXED = {braced(map(braced, layout.fixed))};"

@@ -181,10 +181,8 @@ class _Printer(Printer):
                 before.append(f"V a{name} = splat(0); const bool e{name} = {name}->zero; own(c, {name});")
                 stores.append(f"{{ const V o = {value}; {words}[i] = o; a{name} |= o; }}")
                 after.append(f"{name}->zero = e{name} && !any(a{name});")
-        some = " | ".join(map(values.node, masks))
-        yield "\n".join(
-            [*before, values.ready(), " ".join(values.pointers), LOOP, f"if (!any({some})) continue;"]
-        )
+        skip = f"if (!any({' | '.join(map(values.node, masks))})) continue;"
+        yield "\n".join([*before, values.ready(), " ".join(values.pointers), LOOP, skip])
         yield "\n".join([*values.lines, *stores, "}", *after, "}"])
 
     def words(self, loop: Compute) -> Iterator[str]:

@@ -150,9 +150,8 @@ def load_kernel(code: bytes, source: KernelSource, device: torch.device) -> Laun
         arguments = (ctypes.c_void_p * 1)(ctypes.cast(ctypes.byref(worlds), ctypes.c_void_p))
         with torch.cuda.device(device):
             stream = ctypes.c_void_p(torch.cuda.current_stream(device).cuda_stream)
-            code = cuda.cuLaunchKernel(
-                function, blocks, 1, 1, source.threads, 1, 1, shared, stream, arguments, None
-            )  # fmt: skip
+            shape = (blocks, 1, 1, source.threads, 1, 1)
+            code = cuda.cuLaunchKernel(function, *shape, shared, stream, arguments, None)
         check(code, "a kernel could not be started")
 
     return launch
@@ -233,10 +232,8 @@ class CudaProgram:
             after = self._pack(state)
         device, (batch, height, width) = after.planes.device, after.like["element"][1]
         source, launch = self.kernel(height, width)
-        layout = source.layout
-        flags, numbers = parameters(
-            torch, job.params, layout.param_planes, layout.param_reals, batch, device=device
-        )
+        views = source.layout.param_planes, source.layout.param_reals
+        flags, numbers = parameters(torch, job.params, *views, batch, device=device)
         blocks = -(-batch // source.group)
         scratch = torch.empty(max(1, blocks * source.scratch // 4), dtype=torch.int32, device=device)
         clock = [part.contiguous() for part in (job.clock.seed, job.clock.world, job.clock.step)]
@@ -248,12 +245,10 @@ class CudaProgram:
         (batch, height, width), device = shape_of(state), state["element"].device
         layout = self.kernel(height, width)[0].layout
         row_words = -(-width // 32)
-        planes = torch.zeros(
-            batch, max(1, len(layout.planes)), height, row_words, dtype=torch.int32, device=device
-        )
-        reals = torch.zeros(
-            batch, max(1, len(layout.reals)), height, width, dtype=torch.float32, device=device
-        )
+        shape = batch, max(1, len(layout.planes)), height, row_words
+        planes = torch.zeros(shape, dtype=torch.int32, device=device)
+        shape = batch, max(1, len(layout.reals)), height, width
+        reals = torch.zeros(shape, dtype=torch.float32, device=device)
         for name, value in state.items():
             for piece in self._pieces[name]:
                 if piece.is_real:

@@ -129,10 +129,8 @@ def _resets(program: Program, layout: Layout) -> str:
             planes.append(f"P({layout.planes[slot.name]})[i] = {'valid' if slot.default else '0'};")
         elif slot.resets:
             number, value = layout.reals[slot.name], float(slot.default)
-            need = f"N({number})[i] != 0" if value == 0 else "true"
-            reals.append(
-                f"FOR_BUSY_WORDS(i, [&](int i) {{ return {need}; }}) {{ PLACE(i); LANES {{ CELL; "
-                f"if (inside) F({number})[cell] = {literal(value)}; }} ONCE N({number})[i] = {'0' if value == 0 else 'valid'}; }}"
-            )
+            need, live = (f"N({number})[i] != 0", "0") if value == 0 else ("true", "valid")
+            cells = f"LANES {{ CELL; if (inside) F({number})[cell] = {literal(value)}; }} ONCE N({number})[i] = {live};"
+            reals.append(f"FOR_BUSY_WORDS(i, [&](int i) {{ return {need}; }}) {{ PLACE(i); {cells} }}")
     loop = f"FOR_WORDS(k, i) {{ PLACE(i); {' '.join(planes)} }}" if planes else ""
     return "\n".join(["DEVICE void reset_slots(const Block& c) {", "(void)c;", loop, *reals, "}"])

@@ -63,10 +63,8 @@ class _Printer(Printer):
                 asks.append(f"{name} |= ({values.of(out.value.args[0])} & valid) != 0;")
                 continue
             results.append(f"o_{name}[ROUNDS]")
-            own = f"o_{name}[k]" if loop.stores_last else f"o_{name}"
-            stores.append(
-                f"{'' if loop.stores_last else 'const u32 '}{own} = {values.of(out.value)} & valid;"
-            )
+            own, type = (f"o_{name}[k]", "") if loop.stores_last else (f"o_{name}", "const u32 ")
+            stores.append(f"{type}{own} = {values.of(out.value)} & valid;")
             back.append(f"P({self.numbers[name]})[i] = {own};")
         yield from (f"bool {name} = false;" for name in answers)
         body = ["FOR_WORDS(k, i) { PLACE(i);", *values.lines, *asks, *stores]
@@ -87,9 +85,8 @@ class _Printer(Printer):
             value = cells.of(out.value)
             lives.append(f" u32 {live} = 0;")
             if out.var.type == REAL:
-                stores.append(
-                    f"{{ const float v = {value}; if (inside) F({number})[cell] = v; BALLOT({live}, inside && v != 0); }}"
-                )
+                store = f"const float v = {value}; if (inside) F({number})[cell] = v;"
+                stores.append(f"{{ {store} BALLOT({live}, inside && v != 0); }}")
                 ends.append(f"N({number})[i] = {live};")
                 if out.otherwise is not None and out.otherwise.op == "const":  # old values must be cleared
                     dirty += f" | N({number})[i]"
@@ -124,7 +121,7 @@ class _Words(WordText):
         self.lines.append(f"u32 {name} = {self.known[id(node.args[0])]} & valid;")
         with self.inner() as lines:
             value = self.of(node.args[1])
-        self.lines.append("\n".join([f"if ({name}) {{", *lines, f"{name} &= {value};", "}"]))
+        self.lines += [f"if ({name}) {{", *lines, f"{name} &= {value};", "}"]
         return name
 
     def row(self, dy: int) -> str:
@@ -254,9 +251,7 @@ class _Cells(CellValues[str]):
         with self.inner() as lines:
             value = self.of(comparison)
         name = self.fresh("b")
-        self.lines.append(
-            "\n".join([f"bool {name} = false; if ({first}) {{", *lines, f"{name} = {value}; }}"])
-        )
+        self.lines += [f"bool {name} = false; if ({first}) {{", *lines, f"{name} = {value}; }}"]
         return name
 
     def variable(self, value: str) -> str:
@@ -267,8 +262,6 @@ class _Cells(CellValues[str]):
     def chosen(self, mask: Node, variables: Sequence[str], values: Sequence[Node]) -> None:
         word = self.mask(mask)
         with self.inner() as lines:
-            blends = [
-                f"if (BIT({word})) {name} = {self.of(value)};"
-                for name, value in zip(variables, values, strict=True)
-            ]
-        self.lines.append("\n".join([f"if ({word}) {{", *lines, *blends, "}"]))
+            texts = [self.of(value) for value in values]
+        blends = map(f"if (BIT({word})) {{}} = {{}};".format, variables, texts)
+        self.lines += [f"if ({word}) {{", *lines, *blends, "}"]

@@ -118,9 +118,8 @@ NAMES: dict[int, str] = {}
 for _first, _names in _NUMBERED:
     for _number, _name in enumerate(_names.split(), _first):
         NAMES[_number] = _name
-        OPCODES[_name] = (
-            bytes([_number]) if _number < 256 else bytes([_number >> 8]) + unsigned(_number & 255)
-        )
+        OPCODES[_name] = bytes([_number >> 8 or _number])
+        OPCODES[_name] += unsigned(_number & 255) if _number > 255 else b""
 for _name, _memories in (("size", 1), ("grow", 1), ("copy", 2), ("fill", 1)):
     OPCODES[f"memory.{_name}"] += bytes(_memories)  # their numbers
 RESULTS = {name: _result(name) for name in OPCODES}
@@ -503,9 +502,8 @@ class Module:
 
     def data(self, address: int, octets: bytes) -> None:
         """Add initial bytes of an instance's memory."""
-        self._data.append(
-            b"\0" + const("i32", address).code + OPCODES["end"] + unsigned(len(octets)) + octets
-        )
+        place = b"\0" + const("i32", address).code + OPCODES["end"]
+        self._data.append(place + unsigned(len(octets)) + octets)
 
     def custom(self, name: str, octets: bytes) -> None:
         """Add a custom section, which hosts can read and execution ignores."""
@@ -513,10 +511,8 @@ class Module:
 
     @property
     def code(self) -> bytes:
-        variables = [
-            bytes([TYPES[type], 1]) + const(type, start).code + OPCODES["end"]
-            for type, start in self._globals
-        ]
+        starts = [(TYPES[type], const(type, start).code) for type, start in self._globals]
+        variables = [bytes([type, 1]) + start + OPCODES["end"] for type, start in starts]
         sections = [
             (1, _vector(list(self._types))),
             (3, _vector([unsigned(type) for type, _ in self._functions])),
@@ -528,9 +524,8 @@ class Module:
             *([(11, _vector(self._data))] if self._data else []),
             *((0, section) for section in self._custom),
         ]
-        return b"\0asm\1\0\0\0" + b"".join(
-            bytes([number]) + unsigned(len(section)) + section for number, section in sections
-        )
+        parts = (bytes([number]) + unsigned(len(section)) + section for number, section in sections)
+        return b"\0asm\1\0\0\0" + b"".join(parts)
 
     def listing(self, only: str | None = None) -> str:
         """The functions in the notation of the text format; with `only`, one function and those that it calls."""

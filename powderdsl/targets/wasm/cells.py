@@ -144,9 +144,8 @@ class CellLoop(Loop):
     def copy(self, place: int, source: Value) -> None:
         self.set_live(place, self.live(source))
         with body.when(self.live(source)):
-            self.copy_cells(
-                *(self.library.line_start(field, self.line) for field in (self.outs[place], source))
-            )
+            fields = (self.outs[place], source)
+            self.copy_cells(*(self.library.line_start(field, self.line) for field in fields))
 
     def copy_cells(self, to: Value, source: Value) -> None:
         body.do(self.library.module.once("copy_line", self._copy_line)(to, source))

@@ -333,10 +333,8 @@ class Driver(Batches):
         for lane in range(LANES):
             with body.scope():
                 worlds, world = body.let(batch[WORLDS]), self.world_of(batch, number, lane)
-                bits, values = (
-                    body.let(self.part(batch, 1) + world),
-                    body.let(self.part(batch, 2) + (world << 2)),
-                )
+                bits = body.let(self.part(batch, 1) + world)
+                values = body.let(self.part(batch, 2) + (world << 2))
                 for i in range(len(layout.param_planes)):
                     flags = 0 - counted(load("i32.load8_u", bits))
                     load("i64.load", 0, memory.at("params", i) + 8 * lane).set(flags)
@@ -373,9 +371,8 @@ class Driver(Batches):
         # The four hashes of a vector differ by this: a word of a lane has two, and strips continue each other.
         strip = splat(either(library.strips, library.rows, 0) * (((library.width + 31) >> 5) * (32 * GOLDEN)))
         within = vector(struct.pack("<4I", *[0, 32 * GOLDEN & MASK] * 2))
-        apart = body.let(
-            op("i32x4.add", op("i32x4.mul", strip, vector(struct.pack("<4I", 0, 0, 1, 1))), within)
-        )
+        second_lane = vector(struct.pack("<4I", 0, 0, 1, 1))
+        apart = body.let(op("i32x4.add", op("i32x4.mul", strip, second_lane), within))
         for name, ident, _ in self.program.streams:
             with body.scope():
                 first, second = (library.mixed(op("i32x4.add", base, integers(ident))) for base in bases)

@@ -22,19 +22,15 @@ class RunningModule(Protocol):
 
         Raises MemoryError after a trap: modules trap when their memory is too small.
         """
-        ...
 
     def write(self, at: int, data: Any) -> None:
         """Write bytes to an address of the module's memory."""
-        ...
 
     def read(self, at: int, size: int) -> bytearray:
         """Bytes from an address of the module's memory."""
-        ...
 
     def memory_size(self) -> int:
         """The bytes of the module's memory."""
-        ...
 
 
 Compiled = Callable[[], RunningModule]

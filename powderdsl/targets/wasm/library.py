@@ -125,9 +125,8 @@ class Memory:
         """The floats of a line, with both halos and the overlap of a chunk."""
         self.slots = [(Member("i32.load", 4 * i), False) for i in range(len(layout.planes))]
         """The planes and fields of a group, by number; True for fields."""
-        self.slots += [
-            (Member("i32.load", 4 * (len(self.slots) + i)), True) for i in range(len(layout.reals))
-        ]
+        count = len(layout.planes) + len(layout.reals)
+        self.slots += [(Member("i32.load", 4 * i), True) for i in range(len(layout.planes), count)]
         self.present = Member("i64.load", aligned(4 * len(self.slots), 8))
         """The ids that are present in a group."""
         self.group = aligned(self.present.offset + 8)

@@ -121,11 +121,8 @@ class Instance:
         """The arguments of `load` and `store`, after the batch, for each piece of an array of cells of `size` bytes."""
         plane = shape[-2] * shape[-1] * size
         for piece in self.program.pieces[name]:
-            numbers = numbers_of(piece, self.layout, size)
-            component = piece.component
-            yield (
-                (*numbers, at, plane) if component is None else (*numbers, at + component * plane, 2 * plane)
-            )
+            first, apart = (0, 1) if piece.component is None else (piece.component, 2)
+            yield *numbers_of(piece, self.layout, size), at + first * plane, apart * plane
 
     def new(self, worlds: int, rows: int) -> int:
         """A batch of zeros."""

@@ -56,11 +56,9 @@ def wasm_module(
     schedules = [_schedule(program, pass_, memo) for pass_ in program.passes]
     memory = Memory(width, extent_of(schedules), layout_of(program))
     module = Module(memory.top // PAGE + 1, PAGES)
-    library = Library(memory, module)
-    passes = [
-        module.define(Pass(schedule, library).write, pass_function_name(schedule.name))
-        for schedule in schedules
-    ]
+    library, passes = Library(memory, module), []
+    for schedule in schedules:
+        passes.append(module.define(Pass(schedule, library).write, pass_function_name(schedule.name)))
     tested = reduce(or_, map(tested_ids, schedules), 0)
     calls = Driver(library, program, passes, tested).add(export=face is None)
     if face is not None:

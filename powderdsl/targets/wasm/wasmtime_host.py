@@ -70,9 +70,11 @@ class WasmtimeModule:
     def _compile(self) -> None:
         self._engine = self.engine
         inputs = f"{INSTALLED} {_engine(reserve=True) is self.engine} {sha256(self._code).hexdigest()}"
-        machine_code = persistent(
-            "machine code", inputs, lambda: bytes(wasmtime.Module(self.engine, self._code).serialize())
-        )
+
+        def compile() -> bytes:
+            return bytes(wasmtime.Module(self.engine, self._code).serialize())
+
+        machine_code = persistent("machine code", inputs, compile)
         try:
             module = wasmtime.Module.deserialize(self.engine, machine_code)
         except wasmtime.WasmtimeError:  # made by another processor
@@ -97,15 +99,11 @@ class WasmtimeInstance:
 
     def __init__(self, engine: wasmtime.Engine, module: wasmtime.Module):
         self._store = _keep_alive(wasmtime.Store(engine))
-        exports: dict[str, Any] = dict(
-            wasmtime.Instance(self._store, module, []).exports(self._store).items()
-        )
+        instance = wasmtime.Instance(self._store, module, [])
+        exports: dict[str, Any] = dict(instance.exports(self._store).items())
         self._context = self._store._context()
-        self._functions = {
-            name: ctypes.byref(item._func)
-            for name, item in exports.items()
-            if isinstance(item, wasmtime.Func)
-        }
+        functions = ((name, item) for name, item in exports.items() if isinstance(item, wasmtime.Func))
+        self._functions = {name: ctypes.byref(item._func) for name, item in functions}
         self._memory = exports["memory"]
         self._memory_at = ctypes.byref(self._memory._memory)
         self._raw = (ctypes.c_uint64 * (2 * MOST_ARGUMENTS))()  # of 16 bytes each
