@@ -51,6 +51,8 @@ LAYERS: dict[str, tuple[str, ...]] = {
     "ir.stages": ("diagnostics", "ir"),  # never the model: by now all that is needed is in the IR
     "ir.lower": (*_FRONT, "analysis", "ir"),  # the one door from the model into the IR
     "analysis.costs": ("ir",),  # of passes, as they will run
+    "prover": (*_FRONT, "analysis", "ir", "ir.stages", "ir.lower"),
+    "prover.solver": (),  # knows nothing but clauses
     "schedule": ("diagnostics", "ir"),
     "targets": ("arrays", "diagnostics", "system", "ir", "schedule"),  # what targets share; never the model
     "targets.torch": ("diagnostics", "system", "ir", "schedule", "targets"),

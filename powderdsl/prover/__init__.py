@@ -1,0 +1,1 @@
+"""Proofs about rules, for all worlds, and a SAT solver."""

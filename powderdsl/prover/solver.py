@@ -1,0 +1,308 @@
+"""A SAT solver in plain Python that learns clauses from conflicts.
+
+Inside, literal v is the code 2 v and -v is 2 v + 1, so `code ^ 1` is the negation. Values are told by what is false.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Iterable, Sequence
+from heapq import heapify, heappop, heappush
+from itertools import chain
+from math import inf
+
+RUN = 64  # conflicts before a restart, times Luby's sequence
+KEPT = 2_000  # conflicts before the worse half of the learned clauses is dropped
+DECAY = 0.95  # of the weight of a conflict, with each later one
+
+
+class OutOfWork(Exception):
+    """The solver's budget of work is spent."""
+
+
+class Solver:
+    """An incremental SAT solver; literals are non-zero integers as in DIMACS: v or -v.
+
+    The same calls take the same steps; `work` counts the clauses and literals visited in all calls.
+    """
+
+    def __init__(self) -> None:
+        self.work = 0
+        self._consistent = True
+        self._model: frozenset[int] = frozenset()  # what is false
+        # By literal: 1 + the level at which it became false, 0 if it is not; the clause that made it so, () if none did.
+        self._falsified: list[int] = []
+        self._reasons: list[Sequence[int]] = []
+        # What to look at when a literal becomes false. Of clauses of two literals, the negation of the other; of three,
+        # both others; of more, if it is one of the first two, the clause with the negation of some literal of it.
+        self._pairs: defaultdict[int, list[int]] = defaultdict(list)
+        self._triples: defaultdict[int, list[tuple[int, int]]] = defaultdict(list)
+        self._watches: defaultdict[int, list[tuple[int, list[int]]]] = defaultdict(list)
+        # By variable: its score, the least to be decided first; the score that the heap has, -inf if the variable is not
+        # to be decided; the literal that was false last.
+        self._scores: list[float] = []
+        self._queued: list[float] = []
+        self._phases: list[int] = []
+        self._choice: list[int] = []  # the variables to decide
+        self._heap: list[tuple[float, int]] = []
+        self._weight = 1.0
+        self._trail: list[int] = []  # the false literals in order
+        self._starts: list[int] = []  # of each level but the first, in the trail
+        self._next = 0  # in the trail, the first whose conclusions are to be drawn
+        self._conflicts = 0
+        self._due = KEPT
+        self._learned: list[tuple[int, list[int]]] = []  # clauses with the number of their levels
+        self._used: set[int] = set()  # ids of clauses that took part in conflicts since the last were dropped
+
+    def add_clause(self, literals: Iterable[int]) -> None:
+        """Demands that one of the literals be true; variables are made on demand."""
+        codes = dict.fromkeys(map(self._code, literals))
+        clause = [code for code in codes if not self._falsified[code]]
+        if any(self._falsified[code ^ 1] or code ^ 1 in codes for code in clause):
+            return
+        self._consistent &= bool(clause)
+        if len(clause) > 1:
+            self._attach(clause)
+        elif clause:
+            self._falsify(clause[0] ^ 1, ())
+
+    def solve(
+        self, assumptions: Sequence[int] = (), limit: int | None = None, decide: Iterable[int] | None = None
+    ) -> bool:
+        """Whether all clauses and assumptions can be true.
+
+        With `decide`, only these variables are decided, and if they have values without a conflict, the answer is yes:
+        right if the clauses of all others define them, as those of gates do.
+
+        Raises:
+            OutOfWork: `work` has passed `limit`; what was learned is kept, and the solver can be asked again.
+        """
+        assumed = [self._code(literal) for literal in assumptions]
+        for variable in self._choice:
+            self._queued[variable] = -inf
+        codes = (
+            chain(self._pairs, self._triples, self._watches) if decide is None else map(self._code, decide)
+        )
+        self._choice = list({code >> 1: None for code in codes})
+        for variable in self._choice:
+            self._queued[variable] = self._scores[variable]
+        self._heap = [(self._scores[variable], variable) for variable in self._choice]
+        heapify(self._heap)
+        self.work += len(self._heap)
+        try:
+            return self._consistent and self._search(assumed, limit)
+        finally:
+            self._undo(0)
+
+    def holds(self, literal: int) -> bool:
+        """Whether a literal is true in the last model that `solve` found, where variables without value are False."""
+        return (2 * abs(literal) + 1 in self._model) == (literal > 0)
+
+    def _code(self, literal: int) -> int:
+        if not literal:
+            raise ValueError("a literal is v or -v, never 0")
+        code = 2 * literal if literal > 0 else 1 - 2 * literal
+        if code >= len(self._falsified):
+            old, size = len(self._scores), code + 1  # twice what is needed
+            self._scores += [0.0] * (size - old)
+            self._queued += [-inf] * (size - old)
+            self._phases += range(2 * old, 2 * size, 2)
+            self._falsified += [0] * (2 * (size - old))
+            self._reasons += [()] * (2 * (size - old))
+        return code
+
+    def _attach(self, clause: list[int]) -> None:
+        if len(clause) == 2:
+            for one, two in (clause, clause[::-1]):
+                self._pairs[one].append(two ^ 1)
+        elif len(clause) == 3:
+            one, two, three = clause
+            self._triples[one].append((two, three))
+            self._triples[two].append((one, three))
+            self._triples[three].append((one, two))
+        else:
+            for code in clause[:2]:
+                self._watches[code].append((clause[2] ^ 1, clause))
+
+    def _falsify(self, code: int, reason: Sequence[int]) -> None:
+        self._falsified[code] = len(self._starts) + 1
+        self._reasons[code] = reason
+        self._trail.append(code)
+
+    def _search(self, assumed: Sequence[int], limit: int | None) -> bool:
+        falsified, starts = self._falsified, self._starts
+        run, factor, stop = 1, 1, self._conflicts + RUN
+        while limit is None or self.work <= limit:
+            if conflict := self._propagate():
+                if not starts:
+                    self._consistent = False
+                    return False
+                self._learn(conflict)
+            elif self._conflicts >= stop:
+                run, factor = (run + 1, 1) if run & -run == factor else (run, 2 * factor)
+                stop = self._conflicts + RUN * factor
+                self._undo(0)
+            elif self._conflicts >= self._due and not starts:
+                self._drop()
+            else:
+                code = 0
+                if len(starts) < len(assumed):
+                    code = assumed[len(starts)] ^ 1
+                    if falsified[code ^ 1]:
+                        return False
+                while not code and self._heap:
+                    variable = heappop(self._heap)[1]
+                    self._queued[variable] = inf
+                    if not falsified[2 * variable] and not falsified[2 * variable + 1]:
+                        code = self._phases[variable]
+                if not code:
+                    self._model = frozenset(self._trail)
+                    return True
+                starts.append(len(self._trail))
+                if not falsified[code]:
+                    self._falsify(code, ())
+        raise OutOfWork
+
+    def _undo(self, level: int) -> None:
+        falsified, phases, queued, scores = self._falsified, self._phases, self._queued, self._scores
+        while len(self._starts) > level:
+            self._next = self._starts.pop()
+            for code in self._trail[self._next :]:
+                falsified[code] = 0
+                variable = code >> 1
+                phases[variable] = code
+                if queued[variable] > scores[variable]:
+                    queued[variable] = scores[variable]
+                    heappush(self._heap, (scores[variable], variable))
+            del self._trail[self._next :]
+
+    def _propagate(self) -> Sequence[int]:
+        """Draws all conclusions; a clause that became false, or () if none did."""
+        falsified, reasons, watches = self._falsified, self._reasons, self._watches
+        level = len(self._starts) + 1
+        queue = self._trail[self._next :]
+        conflict: Sequence[int] = ()
+        for false in queue:  # which grows
+            pairs = self._pairs.get(false, ())
+            triples = self._triples.get(false, ())
+            watching = watches.get(false, ())
+            self.work += 1 + len(pairs) + len(triples) + len(watching)
+            for other in pairs:
+                if not falsified[other]:
+                    if falsified[other ^ 1]:
+                        conflict = (false, other ^ 1)
+                    else:
+                        falsified[other] = level
+                        reasons[other] = (false,)
+                        queue.append(other)
+            for one, two in triples:
+                if falsified[two]:
+                    one, two = two, one
+                if falsified[one] and not falsified[two ^ 1]:
+                    if falsified[two]:
+                        conflict = (false, one, two)
+                    else:
+                        falsified[two ^ 1] = level
+                        reasons[two ^ 1] = (false, one)
+                        queue.append(two ^ 1)
+            kept: list[tuple[int, list[int]]] = []
+            if watching:
+                watches[false] = kept
+            for watch in watching:
+                true, clause = watch
+                if not falsified[true]:
+                    if clause[0] == false:
+                        clause[0], clause[1] = clause[1], false
+                    true = clause[0] ^ 1
+                    if not falsified[true]:
+                        for place in range(2, len(clause)):
+                            other = clause[place]
+                            if not falsified[other]:
+                                clause[1], clause[place] = other, false
+                                watches[other].append((true, clause))
+                                break
+                        else:
+                            kept.append(watch)
+                            if falsified[clause[0]]:
+                                conflict = clause
+                            else:
+                                falsified[true] = level
+                                reasons[true] = clause
+                                queue.append(true)
+                        continue
+                    watch = (true, clause)
+                kept.append(watch)
+            if conflict:
+                break
+        self._trail[self._next :] = queue
+        self._next = len(self._trail)
+        return conflict
+
+    def _learn(self, conflict: Sequence[int]) -> None:
+        """Learns a clause from a conflict, and goes back to the level where it draws a conclusion.
+
+        It has one literal of the conflict's level: the last through which all ways from the decision went.
+        """
+        falsified, trail = self._falsified, self._trail
+        current = len(self._starts) + 1
+        seen: set[int] = set()
+        place, here = len(trail), 0
+        while True:
+            if len(conflict) > 3:
+                self._used.add(id(conflict))
+            for code in conflict:
+                if falsified[code] > 1 and code not in seen:
+                    seen.add(code)
+                    here += falsified[code] == current
+            place -= 1
+            while trail[place] not in seen:
+                place -= 1
+            here -= 1
+            if not here:
+                break
+            conflict = self._reasons[trail[place]]
+        self._conflicts += 1
+        self.work += len(seen)
+        for code in seen:
+            self._scores[code >> 1] -= self._weight
+        self._weight /= DECAY
+        older = [code for code in seen if falsified[code] < current]
+        levels = {falsified[code] for code in older}
+        older = [code for code in older if not self._implied(code, seen, levels)]
+        clause = [trail[place], *sorted(older, key=falsified.__getitem__, reverse=True)]
+        if len(clause) > 1:
+            self._attach(clause)
+        if len(clause) > 3 and len(levels) > 1:
+            self._learned.append((len(levels), clause))
+        self._undo(falsified[clause[1]] - 1 if older else 0)
+        self._falsify(clause[0] ^ 1, clause)
+
+    def _implied(self, code: int, seen: set[int], levels: set[int]) -> bool:
+        """Whether a literal is false because others in `seen` are, to which it adds those on the way."""
+        falsified = self._falsified
+        way = [code]
+        for false in way:  # which grows
+            causes = self._reasons[false]
+            new = [
+                cause for cause in causes if falsified[cause] > 1 and cause not in seen and cause not in way
+            ]
+            if not causes or any(falsified[cause] not in levels for cause in new):
+                return False
+            way += new
+        seen.update(way)
+        return True
+
+    def _drop(self) -> None:
+        """Forgets the worse half of the learned clauses: not used of late, over many levels, long."""
+        self._learned.sort(key=lambda pair: (id(pair[1]) not in self._used, pair[0], len(pair[1])))
+        half = len(self._learned) // 2
+        worse = {id(clause) for _, clause in self._learned[half:]}
+        for code, watching in self._watches.items():
+            self._watches[code] = [watch for watch in watching if id(watch[1]) not in worse]
+        del self._learned[half:]
+        self._used = set()
+        self._due = self._conflicts + KEPT
+        self._scores = [score / self._weight for score in self._scores]  # before they overflow
+        self._queued = [score / self._weight for score in self._queued]
+        self._heap = [(score / self._weight, variable) for score, variable in self._heap]
+        self._weight = 1.0
