@@ -363,6 +363,14 @@ def lower_ruleset(ruleset: Ruleset) -> Program:
     )
 
 
+def lower_condition(ruleset: Ruleset, condition: Expr) -> PassGraph:
+    """A condition as a pass that writes the slot `condition`."""
+    build = Graph()
+    parts = [part for slot in slots(ruleset) for part in slot_parts(slot, ruleset)]
+    inputs = Inputs(ruleset, build, {part.name: build.input(part.name, part.type) for part in parts})
+    return PassGraph("condition", "", (), (("condition", node(condition, inputs)),))
+
+
 def live_passes(ruleset: Ruleset) -> tuple[Pass, ...]:
     """The passes without rules whose conditions cannot hold: a loop writes many copies, of which few suit the elements."""
     facts = replace(facts_of(ruleset), budget=Budget(LIVE_BUDGET))

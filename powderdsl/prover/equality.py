@@ -1,0 +1,186 @@
+"""Whether two rulesets do the same with every world, at every step: pass by pass, from any well-formed world."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+from itertools import takewhile
+
+from powderdsl.compiler import lower
+from powderdsl.ir.bits import lower_pass
+from powderdsl.ir.ops import REAL, PassGraph, Program
+from powderdsl.ir.text import structure
+from powderdsl.model.state import Slot, fresh_values, slots
+from powderdsl.model.types import Ruleset
+from powderdsl.prover.induction import HERE, Moment, growing_ranges
+from powderdsl.prover.net import Literal
+from powderdsl.prover.symbolic import (
+    Before,
+    Evaluation,
+    Layout,
+    Names,
+    Symbols,
+    Term,
+    Undecided,
+    World,
+    layouts,
+)
+
+
+@dataclass(frozen=True)
+class Difference:
+    """A question whose answer is a world on which some passes differ, in some slots: its model is that of `moment`."""
+
+    moment: Moment
+    passes: tuple[tuple[int, ...], tuple[int, ...]]
+    """The numbers of the passes of each ruleset."""
+
+
+@dataclass(frozen=True)
+class Side:
+    """One of the two rulesets. `names` are the other's names of parameters and streams by its own."""
+
+    ruleset: Ruleset
+    program: Program
+    names: Names
+
+    @classmethod
+    def of(cls, ruleset: Ruleset, names: Names | None = None) -> Side:
+        return cls(ruleset, lower(ruleset), names or Names())
+
+
+class Shared:
+    """A world of variables, whose numbers have the ranges that both sides share, as one side reads it."""
+
+    def __init__(self, before: Before, own: Mapping[str, Layout], shared: Mapping[str, Layout]) -> None:
+        self.before = before
+        self._missing: dict[str, str | None] = {}
+        """Planes that only this side has: the plane of the sign, if there is one."""
+        for name, row in own.items():
+            common = shared[name]
+            for plane in row.planes[len(common.planes) :]:
+                self._missing[plane] = common.planes[-1] if common.signed else None
+
+    def bit(self, plane: str, y: int, x: int) -> Literal:
+        if plane not in self._missing:
+            return self.before.bit(plane, y, x)
+        sign = self._missing[plane]
+        return self.before.bit(sign, y, x) if sign else 0
+
+    def real(self, slot: str, y: int, x: int) -> Term:
+        return self.before.real(slot, y, x)
+
+
+def why_incomparable(first: Ruleset, second: Ruleset) -> str | None:
+    """The reason why the worlds of two rulesets are not of one kind, or None: elements, slots and what fresh cells hold."""
+
+    def state(slot: Slot, ruleset: Ruleset) -> object:
+        usual = fresh_values(ruleset, slot)
+        return slot.kind.name, slot.resets, slot.of, [usual[element.id] for element in ruleset.elements]
+
+    if [(e.id, e.name) for e in first.elements] != [(e.id, e.name) for e in second.elements]:
+        return "they have other elements"
+    states = [{slot.name: state(slot, ruleset) for slot in slots(ruleset)} for ruleset in (first, second)]
+    if states[0].keys() != states[1].keys():
+        return "their cells hold other fields"
+    for name, value in states[0].items():
+        if value != states[1][name]:
+            return f"`{name}` is of another kind, or fresh cells hold another one"
+    if first.side_multiple != second.side_multiple:
+        return "their worlds have other sides"
+    return None
+
+
+def differs(first: Side, second: Side, limit: int) -> Difference | None:
+    """None if two rulesets with the same state are proven equal, else the first difference of passes.
+
+    Where parameters have other values, each ruleset has its own. Raises Undecided, OutOfWork and NotBits.
+    """
+    params = [[(p.kind, p.default) for p in side.ruleset.params] for side in (first, second)]
+    draws = [[s.bits for s in side.ruleset.streams] for side in (first, second)]
+    if len(draws[0]) == len(draws[1]) and draws[0] != draws[1]:
+        raise Undecided("draws of other sizes")
+    fixed = params[0] != params[1]
+    for numbers in _groups(first.program, second.program):
+        difference = _differ(first, second, numbers, limit, fixed)
+        if difference is not None:
+            return difference
+    return None
+
+
+Numbers = tuple[tuple[int, ...], tuple[int, ...]]
+
+
+def _groups(first: Program, second: Program) -> Iterator[Numbers]:
+    """The passes to compare: one by one if there are as many, otherwise all between those that are the same at both ends."""
+    a, b = first.passes, second.passes
+    if [pass_.name for pass_ in a] == [pass_.name for pass_ in b]:
+        yield from (((i,), (i,)) for i in range(len(a)))
+        return
+
+    def same(pair: tuple[PassGraph, PassGraph]) -> bool:
+        return structure(pair[0], places=False) == structure(pair[1], places=False)
+
+    start = sum(1 for _ in takewhile(same, zip(a, b, strict=False)))
+    end = sum(1 for _ in takewhile(same, zip(a[start:][::-1], b[start:][::-1], strict=False)))
+    yield tuple(range(start, len(a) - end)), tuple(range(start, len(b) - end))
+    yield from (((len(a) - i,), (len(b) - i,)) for i in range(1, end + 1))
+
+
+def _differ(first: Side, second: Side, numbers: Numbers, limit: int, fixed: bool) -> Difference | None:
+    sides = (first, second)
+    own = [layouts(side.ruleset, side.program) for side in sides]
+    shared = {name: _narrower(row, own[1][name]) for name, row in own[0].items()}
+    symbols = Symbols(first.ruleset, first.program, shared=shared)
+    before = Before(symbols)
+    afters: list[World] = []
+    planes: dict[str, bool] = {}
+    for side, slots_, passes in zip(sides, own, numbers, strict=True):
+        world: World = Shared(before, slots_, shared)
+        params = {p.name: p.default for p in side.ruleset.params} if fixed else None
+        for number in passes:
+            outputs = lower_pass(side.program, side.program.passes[number]).outputs
+            planes |= {plane: node.type == REAL for plane, node in outputs}
+            world = Evaluation(world, symbols, replace(side.names, fixed=params)).after(outputs)
+        afters.append(world)
+    ranges = [growing_ranges(side.program) for side in sides]
+    known = {}
+    if all(numbers):
+        first_ranges, theirs = (ranges[i][numbers[i][0]] for i in (0, 1))
+        known = {
+            name: (max(lo, theirs[name][0]), min(hi, theirs[name][1]))
+            for name, (lo, hi) in first_ranges.items()
+            if name in theirs
+        }
+    moment = Moment("passes", symbols, (before,), before, afters[0], known)
+    net = symbols.net
+    wrong = []
+    for plane, is_real in planes.items():
+        if is_real:
+            terms = (world.real(plane, *HERE) for world in afters)
+            wrong.append(moment.questions.equal_floats(*terms) ^ 1)
+    for name in shared:
+        rows = [row[name] for row in own]
+        if any(plane in planes for row in rows for plane in row.planes):
+            count = max(len(row.planes) for row in rows) + 1
+            wrong += map(
+                net.xor, *(_extended(world, row, count) for world, row in zip(afters, rows, strict=True))
+            )
+    return Difference(moment, numbers) if moment.can_be([net.any(wrong)], limit) else None
+
+
+def _extended(world: World, row: Layout, count: int) -> list[Literal]:
+    """The bits of a number in this many planes."""
+    bits = row.bits(world, *HERE)
+    return bits + [bits[-1] if row.signed else 0] * (count - len(bits))
+
+
+def _narrower(a: Layout, b: Layout) -> Layout:
+    """The values that both rows hold."""
+    lo, hi = max(a.lo, b.lo), min(a.hi, b.hi)
+    if lo > hi:
+        raise Undecided("ranges that share no number")
+    fewer = a if len(a.planes) <= len(b.planes) else b
+    if lo >= 0 and fewer.signed and not (a.signed and b.signed):
+        fewer = a if not a.signed else b
+    return replace(fewer, lo=lo, hi=hi)

@@ -1,0 +1,411 @@
+"""Claims that hold by induction: each pass of a step keeps them, whatever the well-formed world before it was."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property, partial
+
+from powderdsl.compiler import lower
+from powderdsl.ir.bits import lower_pass
+from powderdsl.ir.lower import lower_condition
+from powderdsl.ir.ops import Node, Offset, Program, needed
+from powderdsl.model.types import Bounded, Claim, Local, Never, Ruleset, Symmetric, Total, Unchanging
+from powderdsl.prover.net import FALSE, Literal
+from powderdsl.prover.questions import Model, Questions
+from powderdsl.prover.solver import OutOfWork
+from powderdsl.prover.symbolic import (
+    MAX_SIZE,
+    Before,
+    Cell,
+    Evaluation,
+    Ranges,
+    Reset,
+    SubstepEvaluation,
+    Symbols,
+    Turned,
+    Undecided,
+    World,
+)
+
+HERE: Cell = (0, 0)
+
+MAX_WHOLE = 40_000
+"""Gates and terms of a pass that is looked at as a whole."""
+
+Law = Callable[["Moment", World, Cell], Literal]
+"""Whether a claim holds at a cell of a world of a moment."""
+
+
+@dataclass(eq=False)
+class Moment:
+    """A pass, a substep or the start of a step: the worlds before and after it, and questions about them."""
+
+    name: str
+    symbols: Symbols
+    starts: tuple[World, ...]
+    """Worlds that are well-formed; laws are known to hold in the last one."""
+    before: World
+    after: World
+    ranges: Ranges = field(default_factory=dict)
+    evaluation: Evaluation | None = None
+    moves: tuple[tuple[Node, Offset], ...] = ()
+    """Flags of cells that exchange something with a neighbor, and where that is."""
+    only_moves: bool | None = None
+    """Whether it only exchanges elements between cells, once that is known."""
+    model: Model | None = None
+    """The answer to the last question, if there was one."""
+    _facts: dict[object, list[Literal]] = field(default_factory=dict)
+    _evaluations: dict[int, Evaluation] = field(default_factory=dict)
+
+    @cached_property
+    def questions(self) -> Questions:
+        return Questions(self.symbols)
+
+    def condition(self, node: Node, world: World, cell: Cell) -> Literal:
+        """A condition at a cell of a world."""
+        evaluation = self._evaluations.setdefault(id(world), Evaluation(world, self.symbols))
+        return evaluation.value(node, *cell)
+
+    def keeps(self, law: Law, limit: int, given: Sequence[Law] = ()) -> bool:
+        """Whether the law holds in a cell afterwards if it held in all cells before. Raises OutOfWork and Undecided."""
+        broken = law(self, self.after, HERE) ^ 1
+        return broken in (FALSE, law(self, self.before, HERE) ^ 1) or not self.can_be(
+            [broken], limit, [law, *given]
+        )
+
+    def can_be(self, literals: Sequence[Literal], limit: int, laws: Iterable[Law] = ()) -> bool:
+        """Whether literals can hold at once, in well-formed worlds where some laws hold in all cells."""
+        if FALSE in literals:
+            return False
+        net, symbols = self.symbols.net, self.symbols
+        cone = net.cone(literals)
+        cells = symbols.cells_read(cone)
+        given = [law(self, self.starts[-1], cell) for law in laws for cell in {HERE: None, **cells}]
+        facts = [fact for cell, planes in cells.items() for fact in self._well_formed(cell, planes)]
+        concerned = dict.fromkeys([*cone, *net.cone([*given, *facts, *symbols.general])])
+        answer = self.questions.ask([*literals, *given], limit, [*concerned])
+        self.model = self.questions.model([*concerned]) if answer else None
+        return answer
+
+    def _well_formed(self, cell: Cell, planes: Iterable[str]) -> list[Literal]:
+        """What is known of a cell of the starts, as far as it concerns some planes; from now on it is demanded."""
+        key = (cell, *planes)
+        if key not in self._facts:
+            facts = [
+                fact
+                for world in self.starts
+                for fact in self.symbols.well_formed(world, cell, planes, self.ranges)
+            ]
+            self._facts[key] = facts
+            self.symbols.facts += facts
+        return self._facts[key]
+
+
+def growing_ranges(program: Program) -> list[Ranges]:
+    """Before each pass: the ranges of the slots that start each step at their defaults."""
+    ranges = {
+        s.name: (int(s.default), int(s.default)) for s in program.slots if s.resets and s.type.name == "int"
+    }
+    before: list[Ranges] = []
+    for pass_ in program.passes:
+        before.append(dict(ranges))
+        for name, node in pass_.outputs:
+            if name in ranges:
+                ranges[name] = (min(ranges[name][0], node.type.lo), max(ranges[name][1], node.type.hi))
+    return before
+
+
+class Prover:
+    """Proves claims about one ruleset. `limit` bounds the solver's work for each claim and pass.
+
+    Raises NotBits for a ruleset with a pass that bit planes cannot carry.
+    """
+
+    def __init__(self, ruleset: Ruleset, limit: int) -> None:
+        self.ruleset, self.limit = ruleset, limit
+        self.program = lower(ruleset)
+        self.planes = [lower_pass(self.program, pass_) for pass_ in self.program.passes]
+        self.ranges = growing_ranges(self.program)
+        self._substeps: dict[tuple[int, bool], list[Moment]] = {}
+        self._laws: dict[frozenset[int], Law] = {}
+
+    def _symbols(self, limit: int = MAX_SIZE) -> Symbols:
+        return Symbols(self.ruleset, self.program, limit)
+
+    @cached_property
+    def start(self) -> Moment:
+        """The start of a step, where slots are reset."""
+        before = Before(symbols := self._symbols())
+        return Moment("start", symbols, (before,), before, Reset(before, symbols))
+
+    @cached_property
+    def whole(self) -> dict[int, Moment]:
+        """The passes by number. Those that have turned out too large are taken out."""
+        moments = {}
+        for number, pass_ in enumerate(self.planes):
+            evaluation = Evaluation(before := Before(symbols := self._symbols(MAX_WHOLE)), symbols)
+            after = evaluation.after(pass_.outputs)
+            moments[number] = Moment(pass_.name, symbols, (before,), before, after, self.ranges[number])
+        return moments
+
+    def broken_by(self, check: Callable[[Moment], bool]) -> Moment | None:
+        """The first moment of a step that fails a check: passes as a whole, or their substeps where they are too large."""
+        if not check(self.start):
+            return self.start
+        for number in range(len(self.planes)):
+            if number in self.whole:
+                try:
+                    if check(self.whole[number]):
+                        continue
+                    return self.whole[number]
+                except (Undecided, OutOfWork):
+                    if len(self.planes[number].substeps) == 1:
+                        raise
+                    del self.whole[number]
+            for moment in self.substeps(number, cut=True):
+                if not check(moment):
+                    return moment
+        return None
+
+    def substeps(self, number: int, *, cut: bool) -> list[Moment]:
+        """The substeps of a pass. `cut`: each begins with any well-formed world, otherwise with what those before it leave."""
+        if (number, cut) not in self._substeps:
+            self._substeps[number, cut] = self._make_substeps(number, cut)
+        return self._substeps[number, cut]
+
+    def _make_substeps(self, number: int, cut: bool) -> list[Moment]:
+        moments = []
+        pass_, ranges = self.planes[number], self.ranges[number]
+        state: dict[str, Node] = {}
+        row = self.start.symbols.layouts["element"]
+        shared = Evaluation(Before(symbols := self._symbols()), symbols)
+        for place, substep in enumerate(pass_.substeps):
+            elements = [(plane, node) for plane, node in substep.writes if plane in row.planes]
+            moves = tuple(_moves(elements, state.values()))
+            name = f"{pass_.name}.{place}"
+            if cut:
+                begin = Before(symbols := self._symbols())
+                single = SubstepEvaluation(begin, Before(symbols, "now"), pass_, place, symbols)
+                starts = (begin, single.start)
+                moments.append(Moment(name, symbols, starts, single.start, single.end, ranges, single, moves))
+            else:
+                before = shared.after(state.items())
+                after = shared.after((state | dict(substep.writes)).items())
+                moments.append(Moment(name, symbols, (shared.before,), before, after, ranges, shared, moves))
+            state |= dict(substep.writes)
+        return moments
+
+    def broken(self, claim: Claim, without: frozenset[int] = frozenset()) -> Moment | None:
+        """None if the claim is proven for worlds that start without some elements; else a moment that may break it, whose
+        model shows how. Raises OutOfWork and Undecided."""
+        given = [self.reachable(without)] if without else []
+        passes = range(len(self.planes))
+        match claim:
+            case Unchanging():
+                return self.broken_by(partial(self._unchanging, claim.ids, given))
+            case Total(ids=frozenset() as ids):
+                counted = (self._counted(number, ids, claim.trend, given) for number in passes)
+                return next((moment for moment in counted if moment), None)
+            case Symmetric():
+                turned = (self._symmetric(number, claim.turn) for number in passes)
+                return next((moment for moment in turned if moment), None)
+            case Never(steps=1) | Bounded():
+                law = self._law(claim)
+                return self.broken_by(lambda moment: moment.keeps(law, self.limit, given))
+            case Never():
+                return self._never_for(claim, given)
+            case Local() if self._reach() <= claim.radius:
+                return None
+        raise Undecided("this kind of claim")
+
+    def _law(self, claim: Never | Bounded) -> Law:
+        if isinstance(claim, Never):
+            graph = lower_pass(self.program, lower_condition(self.ruleset, claim.condition))
+            ((_, condition),) = graph.outputs
+            return lambda moment, world, cell: moment.condition(condition, world, cell) ^ 1
+        row = self.start.symbols.layouts.get(claim.field)
+        if row is None:
+            raise Undecided("bounds of floats")
+        return lambda moment, world, cell: moment.symbols.net.within(
+            row.bits(world, *cell), claim.lo, claim.hi, signed=row.signed
+        )
+
+    def reachable(self, gone: frozenset[int]) -> Law:
+        """Which elements cells and fields may hold if worlds start without some: a law that every moment keeps."""
+        if gone not in self._laws:
+            self._laws[gone] = self._make_law(gone)
+        return self._laws[gone]
+
+    def _make_law(self, gone: frozenset[int]) -> Law:
+        rows = [row for row in self.start.symbols.layouts.values() if row.slot.kind.name == "element"]
+        allowed = {row.slot.name: set(self.start.symbols.ids) - gone for row in rows}
+
+        def law(moment: Moment, world: World, cell: Cell) -> Literal:
+            net = moment.symbols.net
+            return net.all(net.member(row.bits(world, *cell), allowed[row.slot.name]) for row in rows)
+
+        def add(moment: Moment) -> bool:
+            """True if the moment adds nothing; otherwise what it adds is allowed from now on."""
+            if moment.keeps(law, self.limit):
+                return True
+            for row in rows:
+                bits = map(moment.questions.holds, row.bits(moment.after, *HERE))
+                allowed[row.slot.name].add(sum(bit << i for i, bit in enumerate(bits)))
+            return False
+
+        while self.broken_by(add) is not None:
+            pass
+        return law
+
+    def _never_for(self, claim: Never, given: Sequence[Law]) -> Moment | None:
+        """Whether a condition can hold in a cell for several steps in a row: whole steps, one after the other."""
+        symbols = self._symbols()
+        graph = lower_pass(self.program, lower_condition(self.ruleset, claim.condition))
+        ((_, condition),) = graph.outputs
+        start: World = Before(symbols)
+        moment = Moment("steps", symbols, (start,), start, start)
+        world, holds = start, [moment.condition(condition, start, HERE)]
+        for _ in range(claim.steps - 1):
+            world = Reset(world, symbols)
+            for pass_ in self.planes:
+                world = Evaluation(world, symbols).after(pass_.outputs)
+            holds.append(moment.condition(condition, world, HERE))
+        return moment if moment.can_be(holds, self.limit, given) else None
+
+    def well_formed(self) -> Moment | None:
+        """The first pass or substep that may leave a cell that is not well-formed; None if all keep them."""
+
+        def law(moment: Moment, world: World, cell: Cell) -> Literal:
+            return moment.symbols.net.all(moment.symbols.well_formed(world, cell))
+
+        return self.broken_by(lambda moment: moment.keeps(law, self.limit))
+
+    def _unchanging(self, ids: frozenset[int], given: Sequence[Law], moment: Moment) -> bool:
+        net, row = moment.symbols.net, moment.symbols.layouts["element"]
+        before, after = (row.bits(world, *HERE) for world in (moment.before, moment.after))
+        changed = net.any(map(net.xor, before, after))
+        return not moment.can_be([net.member(before, ids), changed], self.limit, given)
+
+    def _counted(self, number: int, ids: frozenset[int], trend: str, given: Sequence[Law]) -> Moment | None:
+        """The first substep of a pass that may change the number of cells with some elements against a trend."""
+        planes = self.start.symbols.layouts["element"].planes
+        changing = [
+            i for i, s in enumerate(self.planes[number].substeps) if any(p in planes for p, _ in s.writes)
+        ]
+        cuts = [False, True] if number not in self.whole else [False]
+        for cut in cuts:
+            try:
+                moments = self.substeps(number, cut=cut)
+                for i in changing:
+                    if not self._only_moves(moments[i]) and not self._matched(moments[i], ids, trend, given):
+                        return moments[i]
+                return None
+            except (Undecided, OutOfWork):
+                if cut is cuts[-1]:
+                    raise
+        return None
+
+    def _only_moves(self, moment: Moment) -> bool:
+        """Whether a substep only exchanges elements between cells: then it changes no number at all."""
+        if moment.only_moves is not None:
+            return moment.only_moves
+        net, row = moment.symbols.net, moment.symbols.layouts["element"]
+
+        def differ(one: World, cell: Cell, other: World, place: Cell) -> Literal:
+            return net.any(map(net.xor, row.bits(one, *cell), row.bits(other, *place)))
+
+        def breaks(cells: Sequence[Cell]) -> Literal:
+            pairs = zip(cells, reversed(cells), strict=True)
+            return net.any(differ(moment.after, cell, moment.before, other) for cell, other in pairs)
+
+        moment.only_moves = not self._can_break(
+            moment, lambda a, b: differ(moment.before, a, moment.before, b), breaks, ()
+        )
+        return moment.only_moves
+
+    def _matched(self, moment: Moment, ids: frozenset[int], trend: str, given: Sequence[Law]) -> bool:
+        """Whether a substep keeps the number of cells with some elements to a trend."""
+        net, row = moment.symbols.net, moment.symbols.layouts["element"]
+
+        def counted(world: World, cell: Cell) -> Literal:
+            return net.member(row.bits(world, *cell), ids)
+
+        def breaks(cells: Sequence[Cell]) -> Literal:
+            """Whether the number of counted cells, of one or two, changes against the trend."""
+            sums = []
+            for world in (moment.before, moment.after):
+                flags = [counted(world, cell) for cell in cells]
+                sums.append((net.any(flags), net.all(flags)) if len(flags) > 1 else (flags[0], FALSE))
+            more, fewer = (
+                net.any(net.and_(b, a ^ 1) for a, b in zip(*pair, strict=True)) for pair in (sums, sums[::-1])
+            )
+            return {"constant": net.or_(more, fewer), "never rises": more, "never falls": fewer}[trend]
+
+        def differ(cell: Cell, other: Cell) -> Literal:
+            return net.xor(counted(moment.before, cell), counted(moment.before, other))
+
+        return not self._can_break(moment, differ, breaks, given)
+
+    def _can_break(
+        self,
+        moment: Moment,
+        differ: Callable[[Cell, Cell], Literal],
+        breaks: Callable[[Sequence[Cell]], Literal],
+        given: Sequence[Law],
+    ) -> bool:
+        """Whether a sum over all cells may change in a forbidden way, for all that matching shows.
+
+        What moves matches cells in pairs, as far as they differ; other cells stay single. If no cell belongs to two pairs,
+        and no pair and no single cell breaks the rule, neither does the sum.
+        """
+        net = moment.symbols.net
+        assert moment.evaluation is not None
+        value, matched, broken = moment.evaluation.value, list[Literal](), list[Literal]()
+        for node, (dy, dx) in moment.moves:
+            forth = net.and_(value(node, *HERE), differ(HERE, (dy, dx)))
+            back = net.and_(value(node, -dy, -dx), differ((-dy, -dx), HERE))
+            broken.append(net.and_(forth, breaks([HERE, (dy, dx)])))
+            broken += [net.and_(other, event) for other in matched for event in (forth, back)]
+            broken.append(net.and_(forth, back))
+            matched += [forth, back]
+        broken.append(net.and_(net.any(matched) ^ 1, breaks([HERE])))
+        return moment.can_be([net.any(broken)], self.limit, given)
+
+    def _reach(self) -> int:
+        """How many rows or columns away from a cell the cells are on which it depends after a step."""
+        total = 0
+        for pass_ in self.planes:
+            evaluation = Evaluation(before := Before(symbols := self._symbols()), symbols)
+            for _, node in pass_.outputs:
+                evaluation.value(node, *HERE)
+            total += before.reach
+        return total
+
+    def _symmetric(self, number: int, turn: str) -> Moment | None:
+        """None if a pass gives the turned world for a turned world and turned draws."""
+        before = Before(symbols := self._symbols())
+        pass_, net = self.planes[number], symbols.net
+        turned = Turned(before, symbols, turn)
+        plain = Turned(Evaluation(before, symbols).after(pass_.outputs), symbols, turn)
+        symbols.turn = turned.place
+        of_turned = Evaluation(turned, symbols).after(pass_.outputs)
+        first = [of_turned.bit(plane, *HERE) for plane, _ in pass_.outputs]
+        symbols.turn = None
+        second = [plain.bit(plane, *HERE) for plane, _ in pass_.outputs]
+        moment = Moment(pass_.name, symbols, (before,), before, plain, self.ranges[number])
+        return moment if moment.can_be([net.any(map(net.xor, first, second))], self.limit) else None
+
+
+def _moves(writes: Iterable[tuple[str, Node]], known: Iterable[Node]) -> Iterator[tuple[Node, Offset]]:
+    """The movers of a substep, and where they move; `known` nodes are from before."""
+    cut = set(known)
+
+    def contents(node: Node) -> tuple[Node, ...]:
+        if node in cut:
+            return ()
+        return (node.args[0], node.args[2]) if node.op in ("swap", "arrive") else node.args
+
+    nodes = needed([node for _, node in writes], contents)
+    moving = (node for node in nodes if node.op in ("swap", "arrive") and node not in cut)
+    yield from dict.fromkeys((node.args[1], node.attr) for node in moving)

@@ -1,0 +1,498 @@
+"""Worlds as formulas: what a cell holds after some passes, as gates over what cells around it held before.
+
+Bits are literals of a net. Floats are terms that are not interpreted: equal operations on equal terms are equal, and
+little more. The grid is the infinite plane: a world that wraps is a plane that repeats, so what holds for all planes holds for all worlds.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from typing import Any, Protocol
+
+from powderdsl.ir.lower import draws_below
+from powderdsl.ir.ops import OPS, REAL, Node, Offset, PassGraph, Program, Threshold, integer, plane_name
+from powderdsl.model.state import Slot, fresh_values, slots
+from powderdsl.model.types import Ruleset
+from powderdsl.prover.net import FALSE, TRUE, Literal, Net
+
+NAMELESS = ("",)
+
+Term = int
+"""The number of a float term."""
+
+Cell = tuple[int, int]
+
+MAX_SIZE = 1_500_000
+"""Gates and terms of one question."""
+
+
+class Undecided(Exception):
+    """Raised for a question that is too large, or of a kind that formulas do not cover."""
+
+
+class Terms:
+    """Float terms: ``(operation, attribute, *arguments)``. A term is its number; equal terms are one."""
+
+    def __init__(self) -> None:
+        self.terms: list[tuple[object, ...]] = []
+        self._numbers: dict[tuple[object, ...], Term] = {}
+
+    def leaf(self, *name: object) -> Term:
+        """A constant, a parameter, a draw or the content of a slot."""
+        number = self._numbers.setdefault(name, len(self.terms))
+        if number == len(self.terms):
+            self.terms.append(name)
+        return number
+
+    def constant(self, value: float) -> Term:
+        return self.leaf("const", value + 0.0)  # zeros of either sign are alike
+
+    def value(self, term: Term) -> float | None:
+        """The value of a constant."""
+        kind, value, *_ = self.terms[term]
+        return value if kind == "const" else None  # type: ignore[return-value]
+
+    def choose(self, condition: Literal, yes: Term, no: Term) -> Term:
+        if condition & 1:
+            condition, yes, no = condition ^ 1, no, yes
+        for side, term in enumerate((yes, no)):  # the same choice again
+            kind, *parts = self.terms[term]
+            if kind == "select" and parts[0] == condition:
+                yes, no = (parts[1], no) if side == 0 else (yes, parts[2])  # type: ignore[assignment]
+        return no if condition == FALSE or yes == no else self.leaf("select", condition, yes, no)
+
+    def apply(self, op: str, attr: object, args: Sequence[Term]) -> Term:
+        """An operation, evaluated on constants. Sums and products commute; x + 0, x - 0, x · 1 and x / 1 are x."""
+        values = [self.value(arg) for arg in args]
+        if None not in values and OPS[op].evaluate is not None:
+            return self.constant(OPS[op].value(attr, *values))
+        if len(args) == 2:
+            neutral = {"add": 0.0, "sub": 0.0, "mul": 1.0, "div": 1.0}.get(op)
+            if neutral is not None and values[1] == neutral:
+                return args[0]
+            if op in ("add", "mul"):
+                if values[0] == neutral:
+                    return args[1]
+                args = sorted(args)
+        return self.leaf(op, attr, *args)
+
+
+class World(Protocol):
+    """A world, known as formulas."""
+
+    def bit(self, plane: str, y: int, x: int) -> Literal: ...
+    def real(self, slot: str, y: int, x: int) -> Term: ...
+
+
+@dataclass(frozen=True)
+class Layout:
+    """A slot of whole numbers: its bit planes, and which values are well-formed."""
+
+    slot: Slot
+    planes: tuple[str, ...]
+    signed: bool
+    lo: int
+    hi: int
+    usual: tuple[int | None, ...]
+    """By id: the value in fresh cells, None where a parameter decides."""
+    holders: frozenset[int] | None
+    """Elements whose cells may hold other values than the usual one; None for all."""
+
+    def bits(self, world: World, y: int, x: int) -> list[Literal]:
+        return [world.bit(plane, y, x) for plane in self.planes]
+
+
+def layouts(ruleset: Ruleset, program: Program) -> dict[str, Layout]:
+    """The slots of flags and whole numbers by name, that of elements first."""
+    types = {slot.name: slot.type for slot in program.slots}
+    rows = {}
+    for slot in slots(ruleset):
+        if slot.is_real:
+            continue
+        type, prop = types[slot.name], ruleset.property(slot.name)
+        names: tuple[str, ...] = (slot.name,)
+        if type.name == "int":
+            names = tuple(plane_name(slot.name, i) for i in range(type.bits))
+        usual: list[int | None] = [*map(int, fresh_values(ruleset, slot))]
+        if prop is not None:
+            usual = [None if isinstance(value, str) else usual[i] for i, value in enumerate(prop.values)]
+        holders = prop.stored if prop is not None else slot.of
+        rows[slot.name] = Layout(slot, names, type.signed, type.lo, type.hi, tuple(usual), holders or None)
+    return rows
+
+
+class Symbols:
+    """The variables of one question: bits of cells, draws, parameters and places; `facts` are literals that hold.
+
+    `program` is the one whose passes are looked at: its streams, parameters and slots are the ruleset's.
+    """
+
+    def __init__(
+        self,
+        ruleset: Ruleset,
+        program: Program,
+        limit: int = MAX_SIZE,
+        shared: dict[str, Layout] | None = None,
+    ) -> None:
+        self.ruleset = ruleset
+        self.net = Net()
+        self.terms = Terms()
+        self.layouts = shared or layouts(ruleset, program)
+        self.ids = [element.id for element in ruleset.elements]
+        self.facts: list[Literal] = []
+        self.general: list[Literal] = []
+        """Those of them that concern parameters and the numbers of rows, columns and steps."""
+        self.comparisons: dict[tuple[str, Term, Term], Literal] = {}
+        self.draws: dict[str, int] = {}
+        """The streams that were read, with the bits of their draws."""
+        self.limit = limit
+        self.turn: Callable[[Cell], Cell] | None = None
+        """Where the draws and edges of a turned world are in the other one, while a turned world is looked at."""
+        self._owners = {plane: row for row in self.layouts.values() for plane in row.planes}
+        self._known: set[object] = set()
+
+    @property
+    def size(self) -> int:
+        return self.net.size + len(self.terms.terms)
+
+    def _once(self, *key: object) -> bool:
+        """True the first time."""
+        is_new = key not in self._known
+        self._known.add(key)
+        return is_new
+
+    def _add(self, fact: Literal) -> None:
+        self.facts.append(fact)
+        self.general.append(fact)
+
+    def draw(self, stream: str, y: int, x: int, bits: int) -> list[Literal]:
+        self.draws[stream] = bits
+        y, x = self.turn((y, x)) if self.turn else (y, x)
+        return [self.net.variable("draw", stream, y, x, i) for i in range(bits)]
+
+    def parameter(self, name: str, threshold: Threshold | None, bit: int) -> Literal:
+        """A bit of a parameter, or of a chance as a number of draws."""
+        net = self.net
+        literal = net.variable("param", name, threshold, bit)
+        if self._once("param", name, threshold):
+            param = next(param for param in self.ruleset.params if param.name == name)
+            if threshold is not None:
+                bits = [net.variable("param", name, threshold, i) for i in range(threshold.bits + 1)]
+                self._add(net.below(bits, (1 << threshold.bits) + 1))
+            elif param.kind.name == "int":
+                type = integer(int(param.kind.lo), int(param.kind.hi))
+                bits = [net.variable("param", name, None, i) for i in range(type.bits)]
+                self._add(net.within(bits, type.lo, type.hi, signed=type.signed))
+        return literal
+
+    def coordinate(self, axis: str, modulus: int, bit: int, y: int, x: int) -> Literal:
+        """A bit of a row's, a column's or a step's number, modulo something."""
+        if self.turn and axis != "step":
+            raise Undecided("numbers of rows and columns in turned worlds")
+        net, at = self.net, {"row": y, "column": x}.get(axis, 0)
+        # Where sides are no multiple of the modulus, numbers begin again at an edge: each row may then have any.
+        repeats = axis == "step" or self.ruleset.side_multiple % modulus == 0
+        key = (axis, modulus) if repeats else (axis, modulus, at)
+        bits = [net.variable("coordinate", *key, i) for i in range(max((modulus - 1).bit_length(), 1))]
+        if self._once("coordinate", *key):
+            self._add(net.below(bits, modulus))
+        if not repeats:
+            return bits[bit]
+        return net.member(bits, [number for number in range(modulus) if (number + at) % modulus >> bit & 1])
+
+    def inside(self, at: Cell, offset: Offset) -> Literal:
+        """Whether a neighbor lies inside the grid."""
+        if self.turn:
+            at, offset = self.turn(at), self.turn(offset)
+        parts = zip(("row", "column"), at, offset, strict=True)
+        return self.net.all(self.net.variable("inside", axis, a, d) for axis, a, d in parts if d)
+
+    def compare(self, op: str, a: Term, b: Term) -> Literal:
+        """A comparison of floats: a variable, decided only for constants."""
+        left, right = self.terms.value(a), self.terms.value(b)
+        if left is not None and right is not None:
+            return int(bool(OPS[op].value(None, left, right)))
+        key = (op, a, b)
+        if key not in self.comparisons:
+            self.comparisons[key] = self.net.variable("comparison", *key)
+        return self.comparisons[key]
+
+    def cells_read(self, gates: Iterable[int]) -> dict[Cell, dict[str, None]]:
+        """The cells of worlds of variables that are among some gates, with the planes that are read there."""
+        cells: dict[Cell, dict[str, None]] = {}
+        for number in gates:
+            name = self.net.names.get(number, NAMELESS)
+            if name[0] == "cell":
+                _, _, plane, y, x = name
+                cells.setdefault((y, x), {})[plane] = None
+        return cells
+
+    def well_formed(
+        self, world: World, cell: Cell, planes: Iterable[str] | None = None, ranges: Ranges | None = None
+    ) -> list[Literal]:
+        """What every cell fulfills, as far as it concerns these planes: known elements, numbers in their ranges, and
+        usual values in cells of elements that hold no others. `ranges` are narrower ones."""
+        net, element = self.net, self.layouts["element"]
+        owners = (
+            self.layouts.values() if planes is None else dict.fromkeys(map(self._owners.__getitem__, planes))
+        )
+        ids = element.bits(world, *cell)
+        facts = [net.member(ids, self.ids)]
+        for row in owners:
+            if row is element:
+                continue
+            bits = row.bits(world, *cell)
+            if row.slot.kind.name == "element":
+                facts.append(net.member(bits, self.ids))
+            elif row.lo < row.hi:
+                lo, hi = (ranges or {}).get(row.slot.name, (row.lo, row.hi))
+                facts.append(net.within(bits, lo, hi, signed=row.signed))
+            groups: dict[int, list[int]] = {}
+            for identity in self.ids if row.holders is not None else ():
+                value = row.usual[identity]
+                if identity not in row.holders and value is not None:  # type: ignore[operator]
+                    groups.setdefault(value, []).append(identity)
+            for value, members in groups.items():
+                facts.append(net.or_(net.member(ids, members) ^ 1, net.member(bits, [value])))
+        return facts
+
+
+Ranges = Mapping[str, tuple[int, int]]
+
+
+class Before:
+    """A world of variables. Worlds with different tags are independent."""
+
+    def __init__(self, symbols: Symbols, tag: str = "") -> None:
+        self.symbols, self.tag = symbols, tag
+        self.reach = 0
+        """How many rows or columns away the farthest cell that was looked at is."""
+
+    def bit(self, plane: str, y: int, x: int) -> Literal:
+        self.reach = max(self.reach, abs(y), abs(x))
+        return self.symbols.net.variable("cell", self.tag, plane, y, x)
+
+    def real(self, slot: str, y: int, x: int) -> Term:
+        self.reach = max(self.reach, abs(y), abs(x))
+        return self.symbols.terms.leaf("cell", self.tag, slot, y, x)
+
+
+class Reset:
+    """A world at the start of a step: some slots begin with their defaults."""
+
+    def __init__(self, before: World, symbols: Symbols) -> None:
+        self.before = before
+        rows = [row for row in symbols.layouts.values() if row.slot.resets]
+        self.bits = {
+            plane: int(row.slot.default) >> i & 1 for row in rows for i, plane in enumerate(row.planes)
+        }
+
+    def bit(self, plane: str, y: int, x: int) -> Literal:
+        return self.bits[plane] if plane in self.bits else self.before.bit(plane, y, x)
+
+    def real(self, slot: str, y: int, x: int) -> Term:
+        return self.before.real(slot, y, x)
+
+
+class Turned:
+    """A world, ``mirrored`` left to right or ``rotated`` clockwise."""
+
+    def __init__(self, world: World, symbols: Symbols, turn: str) -> None:
+        self.world, self.symbols, self.turn = world, symbols, turn
+        self._directions = {
+            plane: (row, i)
+            for row in symbols.layouts.values()
+            if row.slot.kind.name == "direction"
+            for i, plane in enumerate(row.planes)
+        }
+
+    def place(self, at: Cell) -> Cell:
+        """Where a cell of the turned world is in the world."""
+        return (at[0], -at[1]) if self.turn == "mirrored" else (-at[1], at[0])
+
+    def bit(self, plane: str, y: int, x: int) -> Literal:
+        cell, net = self.place((y, x)), self.symbols.net
+        bit = self.world.bit(plane, *cell)
+        if plane not in self._directions:
+            return bit
+        row, i = self._directions[plane]
+        octants = [4 - octant if self.turn == "mirrored" else octant + 2 for octant in range(8)]
+        turned = net.member(
+            row.bits(self.world, *cell), [n for n, octant in enumerate(octants) if octant % 8 >> i & 1]
+        )
+        if row.holders is None:
+            return turned
+        element = self.symbols.layouts["element"].bits(self.world, *cell)
+        return net.choice(net.member(element, row.holders), turned, bit)  # the usual value does not turn
+
+    def real(self, slot: str, y: int, x: int) -> Term:
+        raise Undecided("floats in turned worlds")
+
+
+@dataclass(frozen=True)
+class Written:
+    """A world some of whose planes are nodes, which `value` evaluates; the others are those of a world before."""
+
+    before: World
+    writes: Mapping[str, Node]
+    value: Callable[[Node, int, int], int]
+
+    def bit(self, plane: str, y: int, x: int) -> Literal:
+        node = self.writes.get(plane)
+        return self.before.bit(plane, y, x) if node is None else self.value(node, y, x)
+
+    def real(self, slot: str, y: int, x: int) -> Term:
+        node = self.writes.get(slot)
+        return self.before.real(slot, y, x) if node is None else self.value(node, y, x)
+
+
+@dataclass(frozen=True)
+class Names:
+    """The names by which another ruleset is read: of its parameters and its streams. `fixed` are values of parameters."""
+
+    params: Mapping[str, str] = field(default_factory=dict)
+    streams: Mapping[str, str] = field(default_factory=dict)
+    fixed: Mapping[str, Any] | None = None
+
+    def stream(self, name: str) -> str:
+        return self.streams.get(name, name)
+
+
+class Evaluation:
+    """Nodes as formulas over a world before."""
+
+    def __init__(self, before: World, symbols: Symbols, names: Names | None = None) -> None:
+        self.before, self.symbols, self.names = before, symbols, names or Names()
+        self._values: dict[tuple[Node, int, int], int] = {}
+
+    def after(self, writes: Iterable[tuple[str, Node]]) -> Written:
+        """The world after some writes."""
+        return Written(self.before, dict(writes), self.value)
+
+    def value(self, node: Node, y: int, x: int) -> int:
+        """The literal of a flag, or the term of a float, in a cell."""
+        key = (node, y, x)
+        value = self._values.get(key)
+        if value is None:
+            value = self._values[key] = self._compute(node, y, x)
+            if self.symbols.size > self.symbols.limit or len(self._values) > 2 * self.symbols.limit:
+                raise Undecided("too many gates")
+        return value
+
+    def _choose(self, is_real: bool, condition: Literal, yes: int, no: int) -> int:
+        choose = self.symbols.terms.choose if is_real else self.symbols.net.choice
+        return choose(condition, yes, no)
+
+    def _parameter(self, attr: tuple[Any, ...], is_real: bool) -> int:
+        name, threshold, *bits = attr
+        bit, fixed = (bits or [0])[0], self.names.fixed
+        if fixed is not None:
+            value = draws_below(fixed[name], threshold) if threshold else fixed[name]
+            return self.symbols.terms.constant(float(value)) if is_real else int(value) >> bit & 1
+        name = self.names.params.get(name, name)
+        return (
+            self.symbols.terms.leaf("param", name)
+            if is_real
+            else self.symbols.parameter(name, threshold, bit)
+        )
+
+    def _compute(self, node: Node, y: int, x: int) -> int:
+        symbols, net, terms, value = self.symbols, self.symbols.net, self.symbols.terms, self.value
+        args, attr, is_real = node.args, node.attr, node.type == REAL
+        match node.op:
+            case "input":
+                return self.before.real(attr, y, x) if is_real else self.before.bit(attr, y, x)
+            case "const":
+                return terms.constant(float(attr)) if is_real else int(bool(attr))
+            case "and":
+                first = value(args[0], y, x)
+                return first if first == FALSE else net.and_(first, value(args[1], y, x))
+            case "or":
+                first = value(args[0], y, x)
+                return first if first == TRUE else net.or_(first, value(args[1], y, x))
+            case "xor":
+                return net.xor(value(args[0], y, x), value(args[1], y, x))
+            case "not":
+                return value(args[0], y, x) ^ 1
+            case "select":
+                condition = value(args[0], y, x)
+                if condition < 2:
+                    return value(args[2 - condition], y, x)
+                return self._choose(is_real, condition, value(args[1], y, x), value(args[2], y, x))
+            case "shift":
+                dy, dx, wraps = attr
+                content = value(args[0], y + dy, x + dx)
+                outside = terms.constant(0.0) if is_real else FALSE
+                return (
+                    content
+                    if wraps
+                    else self._choose(is_real, symbols.inside((y, x), (dy, dx)), content, outside)
+                )
+            case "swap" | "arrive":
+                (dy, dx), (moved, movers, rest) = attr, args
+                came = value(movers, y - dy, x - dx)
+                result = FALSE if came == TRUE else value(rest, y, x)
+                if came != FALSE:
+                    result = self._choose(is_real, came, value(moved, y - dy, x - dx), result)
+                left = value(movers, y, x) if node.op == "swap" else FALSE
+                return self._choose(is_real, left, value(moved, y + dy, x + dx), result) if left else result
+            case "chance":
+                stream, bits, limit = attr
+                return net.below(symbols.draw(self.names.stream(stream), y, x, bits), limit)
+            case "below_planes":
+                stream, bits = attr
+                limits = [value(arg, y, x) for arg in reversed(args)]
+                return net.less(symbols.draw(self.names.stream(stream), y, x, bits), limits)
+            case "param":
+                return self._parameter(attr, is_real)
+            case "coordinate":
+                axis, modulus, *bits = attr
+                return symbols.coordinate(axis, modulus, bits[0] if bits else 0, y, x)
+            case "inside":
+                return symbols.inside((y, x), attr)
+            case "draw":
+                return terms.leaf("draw", self.names.stream(attr[0]), y, x)
+            case "eq" | "lt" | "le":
+                a, b = value(args[0], y, x), value(args[1], y, x)
+                if args[0].type == REAL:
+                    return symbols.compare(node.op, a, b)
+                return {"eq": net.xor(a, b) ^ 1, "lt": net.and_(a ^ 1, b), "le": net.or_(a ^ 1, b)}[node.op]
+        return terms.apply(node.op, attr, [value(arg, y, x) for arg in args])
+
+
+class SubstepEvaluation(Evaluation):
+    """One substep of a pass, from any world that the substeps before may have left."""
+
+    def __init__(self, start: World, now: World, pass_: PassGraph, number: int, symbols: Symbols) -> None:
+        super().__init__(start, symbols)
+        state: dict[str, Node] = {}
+        for substep in pass_.substeps[:number]:
+            state |= dict(substep.writes)
+        self.now = now
+        self._cut = {node: plane for plane, node in state.items() if node.op not in ("input", "const")}
+        self.start = self.after(state.items())
+        """The world before the substep. Planes that no substep wrote are still those of the pass's start."""
+        writes = state | dict(pass_.substeps[number].writes)
+        if number == len(pass_.substeps) - 1:  # floats settle at the end
+            writes |= {plane: node for plane, node in pass_.outputs if node.op != "settle"}
+        self.end = self.after(writes.items())
+
+    def value(self, node: Node, y: int, x: int) -> int:
+        plane = self._cut.get(node)
+        if plane is None:
+            return super().value(node, y, x)
+        return self.now.real(plane, y, x) if node.type == REAL else self.now.bit(plane, y, x)
+
+
+@contextmanager
+def deep_recursion() -> Iterator[None]:
+    """Room for formulas as deep as the gates of a pass: Python's own calls need no stack of the machine's."""
+    before = sys.getrecursionlimit()
+    sys.setrecursionlimit(10 * MAX_SIZE)
+    try:
+        yield
+    finally:
+        sys.setrecursionlimit(before)
