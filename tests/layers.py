@@ -51,8 +51,6 @@ LAYERS: dict[str, tuple[str, ...]] = {
     "ir.stages": ("diagnostics", "ir"),  # never the model: by now all that is needed is in the IR
     "ir.lower": (*_FRONT, "analysis", "ir"),  # the one door from the model into the IR
     "analysis.costs": ("ir",),  # of passes, as they will run
-    "prover": (*_FRONT, "analysis", "ir", "ir.stages", "ir.lower"),
-    "prover.solver": (),  # knows nothing but clauses
     "schedule": ("diagnostics", "ir"),
     "targets": ("arrays", "diagnostics", "system", "ir", "schedule"),  # what targets share; never the model
     "targets.torch": ("diagnostics", "system", "ir", "schedule", "targets"),
@@ -60,6 +58,8 @@ LAYERS: dict[str, tuple[str, ...]] = {
     "targets.wasm": ("diagnostics", "system", "ir", "schedule", "targets"),
     "targets.cuda": ("diagnostics", "system", "ir", "schedule", "targets", "targets.torch", "targets.cpp"),
     "compiler": _COMPILER[:-1],
+    "prover.solver": (),  # knows nothing but clauses
+    "prover": (*_COMPILER, "prover.solver"),  # decides from the IR that backends run
     "simulation": (),
     "simulation.draw": (*_FRONT, "targets"),
     "simulation.state_checks": (*_FRONT, "targets"),
@@ -86,8 +86,8 @@ LAYERS: dict[str, tuple[str, ...]] = {
     "testing.generators": _SCREEN,
     "testing": ("system", "testing.generators"),  # the public names
     "testing.pack_tests": (*_SCREEN, "testing.generators"),
-    "testing.properties": (*_SCREEN, *_TESTING[:-1]),
-    "testing.mutation": (*_SCREEN, *_TESTING),
+    "testing.properties": (*_SCREEN, "prover", *_TESTING[:-1]),
+    "testing.mutation": (*_SCREEN, "prover", *_TESTING),
     "testing.pytest_plugin": (*_SCREEN, *_TESTING),
     "experiments": (),
     "experiments.bench": _SCREEN,

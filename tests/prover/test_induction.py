@@ -1,0 +1,89 @@
+"""Claims by induction: what is proven holds in random worlds, and what is false is not proven."""
+
+from __future__ import annotations
+
+import pytest
+
+from powderdsl.compiler import load
+from powderdsl.model.text import one_line
+from powderdsl.model.types import Ruleset
+from powderdsl.prover.induction import Prover
+from powderdsl.prover.symbolic import Undecided, deep_recursion
+from tests.semantics.texts import load_text
+
+LIMIT = 20_000_000
+
+SMALL = ("brians_brain", "cyclic", "forest_fire", "langtons_ant", "life", "margolus", "wireworld", "core+sand+water")
+
+
+def verdicts(ruleset: Ruleset) -> dict[str, str]:
+    """Each claim of a ruleset with what may break it: a pass, or nothing if it is proven."""
+    broken = {}
+    with deep_recursion():
+        prover = Prover(ruleset, LIMIT)
+        assert prover.well_formed() is None
+        for invariant in ruleset.invariants:
+            moment = prover.broken(invariant.claim, invariant.without)
+            broken[one_line(invariant.span)] = moment.name if moment else ""
+    return broken
+
+
+@pytest.mark.parametrize("rules", SMALL)
+def test_every_claim_of_small_rulesets_is_proven(rules: str) -> None:
+    results = verdicts(load(rules))
+    assert results and not any(results.values())
+
+
+PACK = """
+pack: claims
+elements:
+  ground: {id: 0, color: "#000000"}
+  stone: {id: 1, color: "#808080"}
+  ash: {id: 2, color: "#606060"}
+  ember: {id: 3, color: "#F08000"}
+fields:
+  heat: {type: 0..7, at: element}
+streams: [luck]
+passes:
+  fall:
+    do: swap below if stone and below is ground
+  burn:
+    do:
+      - ember -> ash if luck < 50%
+      - ash -> ember if above is ember and luck < 10%
+      - heat := min(heat + 1, 5) where ember
+invariants:
+"""
+
+
+@pytest.mark.parametrize(
+    ("claim", "breaks"),
+    [
+        ("count(stone) is constant", ""),
+        ("count(ground, stone) is constant", ""),
+        ("count(ember, ash) is constant", ""),
+        ("count(ember) never rises", "burn"),
+        ("count(ash) never falls", "burn"),
+        ("count(ember) never rises without ember", ""),
+        ("count(ash) is constant without ember", ""),
+        ("heat stays in 0..5", ""),
+        ("heat stays in 0..4", "burn"),
+        ("never (stone and heat > 5)", ""),
+        ("never (stone and below is ground)", ""),
+        ("never (stone and below is stone)", "fall"),
+        ("never (ember and above is ember and below is ember)", "burn"),
+        ("stone never changes", "fall"),
+        ("mirrored worlds agree", ""),
+        ("rotated worlds agree", "fall"),
+        ("nothing reaches beyond 2 cells", ""),
+    ],
+)
+def test_claims_are_proven_if_they_are_true(claim: str, breaks: str) -> None:
+    ruleset = load_text(f"{PACK}  - {claim}\n")
+    (found,) = verdicts(ruleset).values()
+    assert found.partition(".")[0] == breaks
+
+
+def test_a_reach_that_is_too_short_is_not_decided() -> None:
+    with pytest.raises(Undecided):
+        verdicts(load_text(f"{PACK}  - nothing reaches beyond 0 cells\n"))
