@@ -13,7 +13,16 @@ from tests.semantics.texts import load_text
 
 LIMIT = 20_000_000
 
-SMALL = ("brians_brain", "cyclic", "forest_fire", "langtons_ant", "life", "margolus", "wireworld", "core+sand+water")
+SMALL = (
+    "brians_brain",
+    "cyclic",
+    "forest_fire",
+    "langtons_ant",
+    "life",
+    "margolus",
+    "wireworld",
+    "core+sand+water",
+)
 
 
 def verdicts(ruleset: Ruleset) -> dict[str, str]:
@@ -31,7 +40,8 @@ def verdicts(ruleset: Ruleset) -> dict[str, str]:
 @pytest.mark.parametrize("rules", SMALL)
 def test_every_claim_of_small_rulesets_is_proven(rules: str) -> None:
     results = verdicts(load(rules))
-    assert results and not any(results.values())
+    assert results
+    assert not any(results.values())
 
 
 PACK = """
