@@ -121,8 +121,9 @@ class Solver:
             self._triples[two].append((one, three))
             self._triples[three].append((one, two))
         else:
-            for code in clause[:2]:
-                self._watches[code].append((clause[2] ^ 1, clause))
+            lists = [self._watches[code] for code in clause]  # made here: each may watch later
+            for watching in lists[:2]:
+                watching.append((clause[2] ^ 1, clause))
 
     def _falsify(self, code: int, reason: Sequence[int]) -> None:
         self._falsified[code] = len(self._starts) + 1

@@ -104,7 +104,7 @@ def test_enumeration_finds_the_models() -> None:
 
 
 def test_small_formulas_against_enumeration() -> None:
-    answers = [answer for seed in range(250) for answer in compared(seed)]
+    answers = [answer for seed in range(2_000) for answer in compared(seed)]
     assert min(answers.count(True), answers.count(False)) > len(answers) // 5
 
 
@@ -134,6 +134,12 @@ def test_no_clauses_and_the_empty_clause() -> None:
 def test_zero_is_no_literal() -> None:
     with pytest.raises(ValueError, match="never 0"):
         Solver().add_clause([1, 0])
+
+
+def test_literals_that_do_not_watch_are_decided_too() -> None:
+    solver = solver_of([(1, 2, 3, 4, 5)])
+    assert solver.solve([-1, -2])
+    assert any(map(solver.holds, (3, 4, 5)))
 
 
 @pytest.mark.parametrize(("count", "holes"), [(5, 4), (6, 5)])
