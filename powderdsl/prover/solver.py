@@ -244,7 +244,7 @@ class Solver:
 
         It has one literal of the conflict's level: the last through which all ways from the decision went.
         """
-        falsified, trail = self._falsified, self._trail
+        falsified, reasons, trail = self._falsified, self._reasons, self._trail
         current = len(self._starts) + 1
         seen: set[int] = set()
         place, here = len(trail), 0
@@ -261,37 +261,26 @@ class Solver:
             here -= 1
             if not here:
                 break
-            conflict = self._reasons[trail[place]]
+            conflict = reasons[trail[place]]
         self._conflicts += 1
         self.work += len(seen)
         for code in seen:
             self._scores[code >> 1] -= self._weight
         self._weight /= DECAY
-        older = [code for code in seen if falsified[code] < current]
-        levels = {falsified[code] for code in older}
-        older = [code for code in older if not self._implied(code, seen, levels)]
-        clause = [trail[place], *sorted(older, key=falsified.__getitem__, reverse=True)]
+        clause = [trail[place]]
+        for code in sorted(seen, key=falsified.__getitem__, reverse=True):
+            causes = reasons[code]
+            if falsified[code] < current and (
+                not causes or any(falsified[cause] > 1 and cause not in seen for cause in causes)
+            ):
+                clause.append(code)  # it does not follow from others
+        levels = len({falsified[code] for code in clause})
         if len(clause) > 1:
             self._attach(clause)
-        if len(clause) > 3 and len(levels) > 1:
-            self._learned.append((len(levels), clause))
-        self._undo(falsified[clause[1]] - 1 if older else 0)
+        if len(clause) > 3 and levels > 2:
+            self._learned.append((levels, clause))
+        self._undo(falsified[clause[1]] - 1 if len(clause) > 1 else 0)
         self._falsify(clause[0] ^ 1, clause)
-
-    def _implied(self, code: int, seen: set[int], levels: set[int]) -> bool:
-        """Whether a literal is false because others in `seen` are, to which it adds those on the way."""
-        falsified = self._falsified
-        way = [code]
-        for false in way:  # which grows
-            causes = self._reasons[false]
-            new = [
-                cause for cause in causes if falsified[cause] > 1 and cause not in seen and cause not in way
-            ]
-            if not causes or any(falsified[cause] not in levels for cause in new):
-                return False
-            way += new
-        seen.update(way)
-        return True
 
     def _drop(self) -> None:
         """Forgets the worse half of the learned clauses: not used of late, over many levels, long."""
