@@ -12,7 +12,7 @@ from itertools import chain
 from math import inf
 
 RUN = 64  # conflicts before a restart, times Luby's sequence
-KEPT = 2_000  # conflicts before the worse half of the learned clauses is dropped
+KEPT = 1_000  # conflicts before the worse half of the learned clauses is dropped
 DECAY = 0.95  # of the weight of a conflict, with each later one
 
 
@@ -38,8 +38,8 @@ class Solver:
         self._pairs: defaultdict[int, list[int]] = defaultdict(list)
         self._triples: defaultdict[int, list[tuple[int, int]]] = defaultdict(list)
         self._watches: defaultdict[int, list[tuple[int, list[int]]]] = defaultdict(list)
-        # By variable: its score, the least to be decided first; the score that the heap has, -inf if the variable is not
-        # to be decided; the literal that was false last.
+        # By variable: its score, of which the least is decided first; the score in the heap, inf if it is not there, -inf
+        # if it is never to be decided; the literal that was false last.
         self._scores: list[float] = []
         self._queued: list[float] = []
         self._phases: list[int] = []
@@ -84,10 +84,10 @@ class Solver:
             chain(self._pairs, self._triples, self._watches) if decide is None else map(self._code, decide)
         )
         self._choice = list({code >> 1: None for code in codes})
-        for variable in self._choice:
-            self._queued[variable] = self._scores[variable]
         self._heap = [(self._scores[variable], variable) for variable in self._choice]
         heapify(self._heap)
+        for score, variable in self._heap:
+            self._queued[variable] = score
         self.work += len(self._heap)
         try:
             return self._consistent and self._search(assumed, limit)
@@ -113,13 +113,11 @@ class Solver:
 
     def _attach(self, clause: list[int]) -> None:
         if len(clause) == 2:
-            for one, two in (clause, clause[::-1]):
-                self._pairs[one].append(two ^ 1)
+            self._pairs[clause[0]].append(clause[1] ^ 1)
+            self._pairs[clause[1]].append(clause[0] ^ 1)
         elif len(clause) == 3:
-            one, two, three = clause
-            self._triples[one].append((two, three))
-            self._triples[two].append((one, three))
-            self._triples[three].append((one, two))
+            for place, code in enumerate(clause):
+                self._triples[code].append((clause[place - 1], clause[place - 2]))
         else:
             lists = [self._watches[code] for code in clause]  # made here: each may watch later
             for watching in lists[:2]:
@@ -141,7 +139,7 @@ class Solver:
                 self._learn(conflict)
             elif self._conflicts >= stop:
                 run, factor = (run + 1, 1) if run & -run == factor else (run, 2 * factor)
-                stop = self._conflicts + RUN * factor
+                stop = self._conflicts + RUN * min(factor, 64)  # or scores might overflow
                 self._undo(0)
             elif self._conflicts >= self._due and not starts:
                 self._drop()
@@ -292,7 +290,7 @@ class Solver:
         del self._learned[half:]
         self._used = set()
         self._due = self._conflicts + KEPT
-        self._scores = [score / self._weight for score in self._scores]  # before they overflow
+        self._scores = [score / self._weight for score in self._scores]
         self._queued = [score / self._weight for score in self._queued]
         self._heap = [(score / self._weight, variable) for score, variable in self._heap]
         self._weight = 1.0
