@@ -43,10 +43,14 @@ TREND_BREAKS: dict[str, Callable[..., Any]] = {"constant": ne, "never rises": gt
 
 @dataclass(frozen=True)
 class Proven:
-    """A statement that holds in every world, at every step. `given` is a condition on the start world, if any."""
+    """A statement that holds in every world, at every step. `given` is a condition on the start world, if any.
+
+    `by` is how it was proven: from the ``ledger``, or by a ``search`` through everything that a cell can be.
+    """
 
     reason: str
     given: str = ""
+    by: str = "ledger"
 
     def __bool__(self) -> bool:
         return True

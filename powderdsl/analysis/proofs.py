@@ -53,7 +53,7 @@ def prove(claim: Claim, ruleset: Ruleset, ledger: Ledger, without: frozenset[int
             return NotProven(f"together the rules of a step might see {reach} cells far")
         case Never():
             if not satisfiable(facts_of(ruleset), [(claim.condition, (0, 0))]):
-                return Proven("no cell can fulfill the condition")
+                return Proven("no cell can fulfill the condition", by="search")
     return NotProven("no proof is known for statements of this kind")
 
 

@@ -211,6 +211,7 @@ parameters = pairs(
     "--set", "PACK.PARAM=VALUE", "Another value of a parameter, such as 5%. May be repeated.", "settings"
 )
 """Names and values are checked later, with the model."""
+proof = option("--prove", (0, 24 * 3600), "Seconds of work for proofs: counted, not timed.", 60)
 world = option("--world", "FILE|NAME", "A .npz, .png, .txt or .yaml file, or the name of a scene.")
 size = option("--size", SIZE, "Rows and columns, such as 48x64.")
 device = click.option("--device", default="cpu", help="A torch device: cpu, cuda, cuda:1.")

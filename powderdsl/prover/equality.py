@@ -16,6 +16,7 @@ from powderdsl.prover.induction import HERE, Moment, growing_ranges
 from powderdsl.prover.net import Literal
 from powderdsl.prover.symbolic import (
     Before,
+    Budget,
     Evaluation,
     Layout,
     Names,
@@ -91,7 +92,7 @@ def why_incomparable(first: Ruleset, second: Ruleset) -> str | None:
     return None
 
 
-def differs(first: Side, second: Side, limit: int) -> Difference | None:
+def differs(first: Side, second: Side, budget: Budget) -> Difference | None:
     """None if two rulesets with the same state are proven equal, else the first difference of passes.
 
     Where parameters have other values, each ruleset has its own. Raises Undecided, OutOfWork and NotBits.
@@ -102,7 +103,7 @@ def differs(first: Side, second: Side, limit: int) -> Difference | None:
         raise Undecided("draws of other sizes")
     fixed = params[0] != params[1]
     for numbers in _groups(first.program, second.program):
-        difference = _differ(first, second, numbers, limit, fixed)
+        difference = _differ(first, second, numbers, budget, fixed)
         if difference is not None:
             return difference
     return None
@@ -127,11 +128,11 @@ def _groups(first: Program, second: Program) -> Iterator[Numbers]:
     yield from (((len(a) - i,), (len(b) - i,)) for i in range(1, end + 1))
 
 
-def _differ(first: Side, second: Side, numbers: Numbers, limit: int, fixed: bool) -> Difference | None:
+def _differ(first: Side, second: Side, numbers: Numbers, budget: Budget, fixed: bool) -> Difference | None:
     sides = (first, second)
     own = [layouts(side.ruleset, side.program) for side in sides]
     shared = {name: _narrower(row, own[1][name]) for name, row in own[0].items()}
-    symbols = Symbols(first.ruleset, first.program, shared=shared)
+    symbols = Symbols(first.ruleset, first.program, budget, shared=shared)
     before = Before(symbols)
     afters: list[World] = []
     planes: dict[str, bool] = {}
@@ -166,7 +167,7 @@ def _differ(first: Side, second: Side, numbers: Numbers, limit: int, fixed: bool
             wrong += map(
                 net.xor, *(_extended(world, row, count) for world, row in zip(afters, rows, strict=True))
             )
-    return Difference(moment, numbers) if moment.can_be([net.any(wrong)], limit) else None
+    return Difference(moment, numbers) if moment.can_be([net.any(wrong)]) else None
 
 
 def _extended(world: World, row: Layout, count: int) -> list[Literal]:

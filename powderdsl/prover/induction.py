@@ -17,6 +17,7 @@ from powderdsl.prover.solver import OutOfWork
 from powderdsl.prover.symbolic import (
     MAX_SIZE,
     Before,
+    Budget,
     Cell,
     Evaluation,
     Ranges,
@@ -67,15 +68,16 @@ class Moment:
         evaluation = self._evaluations.setdefault(id(world), Evaluation(world, self.symbols))
         return evaluation.value(node, *cell)
 
-    def keeps(self, law: Law, limit: int, given: Sequence[Law] = ()) -> bool:
+    def keeps(self, law: Law, given: Sequence[Law] = ()) -> bool:
         """Whether the law holds in a cell afterwards if it held in all cells before. Raises OutOfWork and Undecided."""
         broken = law(self, self.after, HERE) ^ 1
-        return broken in (FALSE, law(self, self.before, HERE) ^ 1) or not self.can_be(
-            [broken], limit, [law, *given]
-        )
+        return broken in (FALSE, law(self, self.before, HERE) ^ 1) or not self.can_be([broken], [law, *given])
 
-    def can_be(self, literals: Sequence[Literal], limit: int, laws: Iterable[Law] = ()) -> bool:
-        """Whether literals can hold at once, in well-formed worlds where some laws hold in all cells."""
+    def can_be(self, literals: Sequence[Literal], laws: Iterable[Law] = ()) -> bool:
+        """Whether literals can hold at once, in well-formed worlds where some laws hold in all cells.
+
+        Raises OutOfWork and Undecided.
+        """
         if FALSE in literals:
             return False
         net, symbols = self.symbols.net, self.symbols
@@ -84,7 +86,7 @@ class Moment:
         given = [law(self, self.starts[-1], cell) for law in laws for cell in {HERE: None, **cells}]
         facts = [fact for cell, planes in cells.items() for fact in self._well_formed(cell, planes)]
         concerned = dict.fromkeys([*cone, *net.cone([*given, *facts, *symbols.general])])
-        answer = self.questions.ask([*literals, *given], limit, [*concerned])
+        answer = self.questions.ask([*literals, *given], [*concerned])
         self.model = self.questions.model([*concerned]) if answer else None
         return answer
 
@@ -117,13 +119,13 @@ def growing_ranges(program: Program) -> list[Ranges]:
 
 
 class Prover:
-    """Proves claims about one ruleset. `limit` bounds the solver's work for each claim and pass.
+    """Proves claims about one ruleset, with a budget for all of them.
 
     Raises NotBits for a ruleset with a pass that bit planes cannot carry.
     """
 
-    def __init__(self, ruleset: Ruleset, limit: int) -> None:
-        self.ruleset, self.limit = ruleset, limit
+    def __init__(self, ruleset: Ruleset, budget: Budget) -> None:
+        self.ruleset, self.budget = ruleset, budget
         self.program = lower(ruleset)
         self.planes = [lower_pass(self.program, pass_) for pass_ in self.program.passes]
         self.ranges = growing_ranges(self.program)
@@ -131,7 +133,7 @@ class Prover:
         self._laws: dict[frozenset[int], Law] = {}
 
     def _symbols(self, limit: int = MAX_SIZE) -> Symbols:
-        return Symbols(self.ruleset, self.program, limit)
+        return Symbols(self.ruleset, self.program, self.budget, limit)
 
     @cached_property
     def start(self) -> Moment:
@@ -212,7 +214,7 @@ class Prover:
                 return next((moment for moment in turned if moment), None)
             case Never(steps=1) | Bounded():
                 law = self._law(claim)
-                return self.broken_by(lambda moment: moment.keeps(law, self.limit, given))
+                return self.broken_by(lambda moment: moment.keeps(law, given))
             case Never():
                 return self._never_for(claim, given)
             case Local() if self._reach() <= claim.radius:
@@ -247,7 +249,7 @@ class Prover:
 
         def add(moment: Moment) -> bool:
             """True if the moment adds nothing; otherwise what it adds is allowed from now on."""
-            if moment.keeps(law, self.limit):
+            if moment.keeps(law):
                 return True
             for row in rows:
                 bits = map(moment.questions.holds, row.bits(moment.after, *HERE))
@@ -271,21 +273,22 @@ class Prover:
             for pass_ in self.planes:
                 world = Evaluation(world, symbols).after(pass_.outputs)
             holds.append(moment.condition(condition, world, HERE))
-        return moment if moment.can_be(holds, self.limit, given) else None
+        return moment if moment.can_be(holds, given) else None
 
     def well_formed(self) -> Moment | None:
         """The first pass or substep that may leave a cell that is not well-formed; None if all keep them."""
 
-        def law(moment: Moment, world: World, cell: Cell) -> Literal:
-            return moment.symbols.net.all(moment.symbols.well_formed(world, cell))
+        def keeps(moment: Moment) -> bool:
+            facts = moment.symbols.well_formed(moment.after, HERE)
+            return not moment.can_be([moment.symbols.net.all(facts) ^ 1])
 
-        return self.broken_by(lambda moment: moment.keeps(law, self.limit))
+        return self.broken_by(keeps)
 
     def _unchanging(self, ids: frozenset[int], given: Sequence[Law], moment: Moment) -> bool:
         net, row = moment.symbols.net, moment.symbols.layouts["element"]
         before, after = (row.bits(world, *HERE) for world in (moment.before, moment.after))
         changed = net.any(map(net.xor, before, after))
-        return not moment.can_be([net.member(before, ids), changed], self.limit, given)
+        return not moment.can_be([net.member(before, ids), changed], given)
 
     def _counted(self, number: int, ids: frozenset[int], trend: str, given: Sequence[Law]) -> Moment | None:
         """The first substep of a pass that may change the number of cells with some elements against a trend."""
@@ -370,7 +373,7 @@ class Prover:
             broken.append(net.and_(forth, back))
             matched += [forth, back]
         broken.append(net.and_(net.any(matched) ^ 1, breaks([HERE])))
-        return moment.can_be([net.any(broken)], self.limit, given)
+        return moment.can_be([net.any(broken)], given)
 
     def _reach(self) -> int:
         """How many rows or columns away from a cell the cells are on which it depends after a step."""
@@ -394,7 +397,7 @@ class Prover:
         symbols.turn = None
         second = [plain.bit(plane, *HERE) for plane, _ in pass_.outputs]
         moment = Moment(pass_.name, symbols, (before,), before, plain, self.ranges[number])
-        return moment if moment.can_be([net.any(map(net.xor, first, second))], self.limit) else None
+        return moment if moment.can_be([net.any(map(net.xor, first, second))]) else None
 
 
 def _moves(writes: Iterable[tuple[str, Node]], known: Iterable[Node]) -> Iterator[tuple[Node, Offset]]:

@@ -26,6 +26,9 @@ class Model:
     has_edges: bool
 
 
+GATE = 10
+"""Units of work for making a gate and its clauses."""
+
 MAX_ROUNDS = 400
 """How often an answer is asked for again because equal floats compared differently in it."""
 
@@ -38,7 +41,7 @@ class Questions:
         self.solver = Solver()
         self.same: dict[tuple[Term, Term], Literal] = {}
         """Literals that two floats are equal."""
-        self._facts = 0
+        self._facts = self._size = 0
         self._encoded: set[int] = set()
         self._model: dict[int, bool] = {}
 
@@ -83,9 +86,7 @@ class Questions:
         if TRUE not in literals:
             self.solver.add_clause([self._number(literal) for literal in literals if literal != FALSE])
 
-    def ask(
-        self, literals: Sequence[Literal], limit: int | None = None, concerned: Sequence[int] | None = None
-    ) -> bool:
+    def ask(self, literals: Sequence[Literal], concerned: Sequence[int] | None = None) -> bool:
         """Whether all of these can hold at once; then `holds` tells how. Raises OutOfWork.
 
         `concerned`: the gates that matter, if it is known; all others follow, or can be made to fit.
@@ -101,11 +102,20 @@ class Questions:
             concerned = self.net.cone([*literals, *known])
         for _ in range(MAX_ROUNDS):
             self._model = {}
-            if not self.solver.solve(assumptions, limit=limit, decide=concerned):
+            if not self._solve(assumptions, concerned):
                 return False
             if not self._refine(concerned):
                 return True
         raise OutOfWork
+
+    def _solve(self, assumptions: Sequence[int], concerned: Sequence[int]) -> bool:
+        budget, before = self.symbols.budget, self.solver.work
+        budget.spend(GATE * (self.symbols.size - self._size))
+        self._size = self.symbols.size
+        try:
+            return self.solver.solve(assumptions, limit=before + budget.left, decide=concerned)
+        finally:
+            budget.left -= self.solver.work - before
 
     def holds(self, literal: Literal) -> bool:
         """The value of a literal in the model of the last question; variables that it did not concern are false."""

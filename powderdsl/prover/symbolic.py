@@ -17,6 +17,7 @@ from powderdsl.ir.ops import OPS, REAL, Node, Offset, PassGraph, Program, Thresh
 from powderdsl.model.state import Slot, fresh_values, slots
 from powderdsl.model.types import Ruleset
 from powderdsl.prover.net import FALSE, TRUE, Literal, Net
+from powderdsl.prover.solver import OutOfWork
 
 NAMELESS = ("",)
 
@@ -29,8 +30,30 @@ MAX_SIZE = 1_500_000
 """Gates and terms of one question."""
 
 
+WORK_PER_SECOND = 1_000_000
+"""Units of work that a slow machine does in a second: clauses and literals that the solver visits, and a tenth of a gate."""
+
+
 class Undecided(Exception):
     """Raised for a question that is too large, or of a kind that formulas do not cover."""
+
+
+@dataclass
+class Budget:
+    """The work that is left, counted so that it ends at the same place on every machine."""
+
+    left: int
+
+    @classmethod
+    def of(cls, seconds: float) -> Budget:
+        """The work that takes about this many seconds."""
+        return cls(int(seconds * WORK_PER_SECOND))
+
+    def spend(self, work: int) -> None:
+        """Raises OutOfWork if there is not enough left."""
+        self.left -= work
+        if self.left < 0:
+            raise OutOfWork
 
 
 class Terms:
@@ -134,10 +157,11 @@ class Symbols:
         self,
         ruleset: Ruleset,
         program: Program,
+        budget: Budget,
         limit: int = MAX_SIZE,
         shared: dict[str, Layout] | None = None,
     ) -> None:
-        self.ruleset = ruleset
+        self.ruleset, self.budget = ruleset, budget
         self.net = Net()
         self.terms = Terms()
         self.layouts = shared or layouts(ruleset, program)

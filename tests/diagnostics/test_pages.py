@@ -39,7 +39,7 @@ from powderdsl.rl import preset
 from powderdsl.simulation.standalone import standalone_module
 from powderdsl.system.writing import replacing
 from powderdsl.tasks.shipped import load_task, load_task_with_diagnostics
-from powderdsl.testing.properties.search import refuted
+from powderdsl.testing.properties.search import quick_results, refuted
 from powderdsl.worldmodel import training
 from powderdsl.worldmodel.config import DataConfig, Machine, TrainConfig
 from powderdsl.worldmodel.networks import custom_network
@@ -120,7 +120,10 @@ def diagnostics_of(one: Example) -> tuple[Diagnostic, ...]:
             read_ascii(one.text, paper_rules().elements, name="page.txt")
             return ()
         ruleset, remarks = load_with_diagnostics(*one.packs, path)
-        return (*remarks, *refuted(ruleset, ledger(ruleset)))  # what `powderdsl check` says
+        return (
+            *remarks,
+            *refuted(ruleset, quick_results(ruleset, ledger(ruleset))),
+        )  # what `powderdsl check` says
     except CompileError as error:
         return error.diagnostics
 

@@ -8,10 +8,8 @@ from powderdsl.compiler import load
 from powderdsl.model.text import one_line
 from powderdsl.model.types import Ruleset
 from powderdsl.prover.induction import Prover
-from powderdsl.prover.symbolic import Undecided, deep_recursion
+from powderdsl.prover.symbolic import Budget, Undecided, deep_recursion
 from tests.semantics.texts import load_text
-
-LIMIT = 20_000_000
 
 SMALL = (
     "brians_brain",
@@ -29,7 +27,7 @@ def verdicts(ruleset: Ruleset) -> dict[str, str]:
     """Each claim of a ruleset with what may break it: a pass, or nothing if it is proven."""
     broken = {}
     with deep_recursion():
-        prover = Prover(ruleset, LIMIT)
+        prover = Prover(ruleset, Budget.of(60))
         assert prover.well_formed() is None
         for invariant in ruleset.invariants:
             moment = prover.broken(invariant.claim, invariant.without)

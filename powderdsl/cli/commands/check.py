@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -39,6 +40,8 @@ class Checked:
     loaded: Ruleset | Task | None = None
     cost: tuple[PassCost, ...] | None = None
     ledger: Ledger | None = None
+    claims: tuple[dict[str, Any], ...] = ()
+    """The verdicts on invariants, as JSON; with the line that shows each."""
 
     def number(self, severity: Severity) -> int:
         return sum(diagnostic.severity is severity for diagnostic in self.diagnostics)
@@ -49,7 +52,9 @@ class Checked:
 @opt.option("--json", bool, "One JSON list instead of text.", to="as_json")
 @opt.option("--notes", bool, "Also list notes, such as inactive rules.")
 @opt.option("--warnings-as-errors", bool, "Exit with 1 if there are warnings.")
-@opt.option("--quick", bool, "Check only the rules themselves; do not try invariants.")
+@opt.option("--quick", bool, "Check only the rules themselves; do not judge invariants.")
+@opt.proof
+@opt.option("--claims", bool, "Also list each invariant: proven, refuted or tested; in JSON as a key.")
 @opt.option("--cost", bool, "Also report what each pass costs; in JSON as a second key.")
 @opt.option("--ledger", bool, "Also report what rules create, destroy and move; in JSON as a key.")
 def command(
@@ -58,17 +63,21 @@ def command(
     notes: bool,
     warnings_as_errors: bool,
     quick: bool,
+    prove: int,
+    claims: bool,
     cost: bool,
     ledger: bool,
 ) -> int:
     """Find the mistakes in rule files and tasks, all at once, and invariants that do not hold.
+
+    Invariants are proven where that is possible, else tried on a few small worlds.
 
     Each RULES is checked by itself; packs that belong together are joined by `+`: core+my/pack.yaml. A task is
     a shipped one by name, or a file that begins with `task:`.
 
     Exit code: 0 without errors, 1 with warnings under --warnings-as-errors, 2 with errors.
     """
-    results = [_check(name, quick, cost, ledger) for name in rules]
+    results = [_check(name, None if quick else prove, cost, ledger) for name in rules]
     # Compositions share packs: a dictionary has each diagnostic once.
     shown = dict.fromkeys(
         diagnostic
@@ -78,8 +87,10 @@ def command(
     )
     if as_json:
         data: Any = [diagnostic_data(diagnostic) for diagnostic in shown]
-        if cost or ledger:
+        if cost or ledger or claims:
             data = {"diagnostics": data}
+        if claims:
+            data["claims"] = {result.name: result.claims for result in results}
         if cost:
             data["cost"] = {result.name: result.cost for result in results if result.cost is not None}
         if ledger:
@@ -91,19 +102,21 @@ def command(
         write_diagnostics(shown, sys.stdout)
         click.echo()
     if not as_json:
-        click.echo("\n".join(line for result in results for line in _lines(result, notes)))
+        click.echo("\n".join(line for result in results for line in _lines(result, notes, claims)))
     if any(result.number(Severity.ERROR) for result in results):
         return BAD_INPUT
     warned = any(result.number(Severity.WARNING) for result in results)
     return FAILED if warned and warnings_as_errors else OK
 
 
-def _lines(result: Checked, notes: bool) -> Iterator[str]:
-    """The summary of one RULES, its cost and its ledger."""
+def _lines(result: Checked, notes: bool, claims: bool) -> Iterator[str]:
+    """The summary of one RULES, its invariants, its cost and its ledger."""
     yield _summary(result, notes)
     for diagnostic in () if notes else result.diagnostics:
         if diagnostic.code in ALWAYS_SHOWN:
             yield f"  {diagnostic.message}"
+    if claims and result.claims:
+        yield from ("", *(claim["line"] for claim in result.claims))
     if result.cost is not None:
         yield from ("", *_cost_lines(result.cost))
     if result.ledger is not None:
@@ -112,7 +125,7 @@ def _lines(result: Checked, notes: bool) -> Iterator[str]:
         yield from ("", ledger_text(result.ledger))
 
 
-def _check(name: str, quick: bool, cost: bool, ledger: bool) -> Checked:
+def _check(name: str, prove: int | None, cost: bool, ledger: bool) -> Checked:
     try:
         if is_task(name):
             from powderdsl.tasks.shipped import load_task_with_diagnostics  # brings numpy
@@ -122,22 +135,27 @@ def _check(name: str, quick: bool, cost: bool, ledger: bool) -> Checked:
         ruleset, diagnostics = load_with_diagnostics(name)
     except CompileError as error:
         return Checked(name, error.diagnostics)
-    if ruleset.invariants and not quick:
-        title = f"invariants of {ruleset.name}"
-        broken = persistent(title, ruleset.text_key, lambda: _refuted(ruleset))
+    claims: tuple[dict[str, Any], ...] = ()
+    if ruleset.invariants and prove is not None:
+        title, key = f"invariants of {ruleset.name}", f"{prove} {ruleset.text_key}"
+        broken, claims = persistent(title, key, lambda: _judged(ruleset, prove))
         diagnostics = (*diagnostics, *broken)
     expenses = None
     if cost:
         from powderdsl.analysis.costs import costs
 
         expenses = costs(lower(ruleset))
-    return Checked(name, diagnostics, ruleset, expenses, _ledger(ruleset) if ledger else None)
+    return Checked(name, diagnostics, ruleset, expenses, _ledger(ruleset) if ledger else None, claims)
 
 
-def _refuted(ruleset: Ruleset) -> tuple[Diagnostic, ...]:
-    from powderdsl.testing.properties.search import refuted  # brings numpy
+def _judged(ruleset: Ruleset, prove: int) -> tuple[tuple[Diagnostic, ...], tuple[dict[str, Any], ...]]:
+    """What is wrong with invariants, and the verdict on each."""
+    from powderdsl.testing.properties.outcomes import result_data, result_line
+    from powderdsl.testing.properties.search import quick_results, refuted  # brings numpy
 
-    return refuted(ruleset, _ledger(ruleset))
+    results = quick_results(ruleset, _ledger(ruleset), prove)
+    claims = tuple({**result_data(result), "line": result_line(result)} for result in results)
+    return refuted(ruleset, results), claims
 
 
 def _ledger(ruleset: Ruleset) -> Ledger:
@@ -167,6 +185,13 @@ def _summary(result: Checked, notes: bool) -> str:
         parts += [counted(len(loaded.elements), "element"), counted(len(loaded.passes), "pass", "passes")]
     elif loaded is not None:
         parts.append(counted(len(loaded.splits), "split"))
+    if result.claims:
+        verdicts = Counter(claim["status"] for claim in result.claims)
+        numbers = ", ".join(f"{number} {status}" for status, number in verdicts.items())
+        all_proven = verdicts["proven"] == len(result.claims)
+        parts.append(
+            f"{counted(len(result.claims), 'invariant')} ({'all proven' if all_proven else numbers})"
+        )
     parts.append(counted(result.number(Severity.ERROR), "error"))
     if warnings := result.number(Severity.WARNING):
         parts.append(counted(warnings, "warning"))

@@ -50,6 +50,7 @@ MAX_SECONDS = 24 * 3600
 @opt.option("--examples", (0, 10_000_000), "Random worlds on which each invariant is tried.", 1000)
 @opt.option("--seconds", (1, MAX_SECONDS), "Time limit for random worlds, per RULES, in seconds.", 60)
 @opt.option("--seed", (0, 2**31 - 1), "Seed of the random worlds.", 0)
+@opt.proof
 @opt.path("--replay", "FILE", "Only try this counterexample again.")
 @opt.output("--picture", "FILE", "Draw the first counterexample, before and after, as a .png.", ".png")
 @click.option(
@@ -72,6 +73,7 @@ def command(
     examples: int,
     seconds: int,
     seed: int,
+    prove: int,
     replay: Path | None,
     picture: Path | None,
     keep: bool | None,
@@ -96,7 +98,7 @@ def command(
         raise BadInput("--replay takes the one RULES that the counterexample breaks")
     if keep is None:
         keep = not os.environ.get("CI")  # a machine that runs tests and is thrown away
-    session = _Report(backend, SearchPlan(examples, float(seconds), seed), keep, picture, as_json)
+    session = _Report(backend, SearchPlan(examples, float(seconds), seed, prove), keep, picture, as_json)
     for name in rules or shipped_tests():
         ruleset = opt.load_rules(name, settings)
         if replay is not None:
@@ -218,7 +220,7 @@ class _Report:
         if result is None:
             raise BadInput(f"{path}: {ruleset.name} has no invariant `{text}`")
         search.trials = [result]
-        result.reason, result.is_proven, result.worlds = "", False, 1
+        result.reason, result.proof, result.worlds = "", "", 1
         if breaks(result.prop.claim, runner, sample, steps).first.any():
             result.sample, result.steps = sample, steps
             result.counterexample = counterexample(result.prop.claim, runner, sample, steps)

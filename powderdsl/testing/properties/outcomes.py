@@ -87,7 +87,8 @@ class Result:
 
     prop: Property
     reason: str = ""
-    is_proven: bool = False
+    proof: str = ""
+    """How it was proven: ``ledger``, ``search`` or ``induction``; empty if it is not."""
     doubts: tuple[RuleLine, ...] = ()
     """The lines that stand in the way of a proof."""
     worlds: int = 0
@@ -96,6 +97,10 @@ class Result:
     steps: int = 0
     counterexample: Counterexample | None = None
     difference: Difference | None = None
+
+    @property
+    def is_proven(self) -> bool:
+        return bool(self.proof)
 
     @property
     def status(self) -> str:
@@ -113,7 +118,7 @@ class Result:
 def result_line(result: Result) -> str:
     """`proven    core: … (…)`."""
     how = {
-        "proven": result.reason,
+        "proven": f"{result.proof}: {result.reason}",
         "tested": f"{result.worlds:,} worlds{', ' + result.reason if result.reason else ''}",
         "untested": UNTESTED,
         "differs": difference_words(result.difference) if result.difference else "",
@@ -187,6 +192,7 @@ def result_data(result: Result) -> dict[str, Any]:
         "pack": result.prop.owner,
         "place": result.prop.place,
         "status": result.status,
+        "proof": result.proof or None,
         "worlds": result.worlds,
         "reason": UNTESTED if result.status == "untested" else result.reason,
     }

@@ -19,7 +19,9 @@ from powderdsl.model.check import select_packs
 from powderdsl.model.composition.added_packs import Cause, Difference
 from powderdsl.model.text import place_of
 from powderdsl.model.types import Never, Ruleset, Symmetric
+from powderdsl.prover.verdicts import judgments
 from powderdsl.simulation.draw import shown_fields
+from powderdsl.system.cache import persistent
 from powderdsl.testing.generators.cases import Array, Start
 from powderdsl.testing.properties.blame import culprits, difference, translated
 from powderdsl.testing.properties.breaks import (
@@ -33,6 +35,7 @@ from powderdsl.testing.properties.breaks import (
     is_paired,
     steps_for,
 )
+from powderdsl.testing.properties.models import starts
 from powderdsl.testing.properties.outcomes import Counterexample, Property, Result, counterexample_lines
 from powderdsl.testing.properties.running import LARGE, Oracle, Runs, join_starts, random_samples
 
@@ -48,6 +51,10 @@ WORK = 500_000_000
 """Work for making worlds small, ten seconds or so: most need a hundredth of it."""
 
 
+PROOF = 60.0
+"""Seconds of work for proofs: twice as much as the largest shipped ruleset needs."""
+
+
 @dataclass(frozen=True)
 class SearchPlan:
     """The extent of a search: the number of random worlds, the time limit in seconds, the first seed."""
@@ -55,6 +62,8 @@ class SearchPlan:
     examples: int = 1000
     seconds: float = 60.0
     seed: int = 0
+    proof: float = PROOF
+    """Seconds of work for proofs by induction, counted; 0 for none."""
 
 
 @dataclass
@@ -73,25 +82,53 @@ class InvariantSearch:
 
     @classmethod
     def of(
-        cls, runner: Runs, plan: SearchPlan, declared_only: bool = False, ledger: Ledger | None = None
+        cls,
+        runner: Runs,
+        plan: SearchPlan,
+        declared_only: bool = False,
+        ledger: Ledger | None = None,
+        texts: Collection[str] | None = None,
     ) -> Self:
         """Prove what can be proven; the rest is to be tried. `declared_only`: leave out what no pack claims.
 
-        `ledger`: that of the rules, if it is known already.
+        `ledger`: that of the rules, if it is known already; `texts`: the only claims that matter.
         """
         ledger = ledger or make_ledger(runner.ruleset)
         search = cls(runner, plan, ledger=ledger)
         for prop in properties_of(runner.ruleset):
+            if texts is not None and prop.text not in texts:
+                continue
             if prop.owner == AUTOMATIC:
                 search.trials += [] if declared_only else [Result(prop)]
                 continue
             verdict = prove(prop.claim, runner.ruleset, ledger, prop.without)  # type: ignore[arg-type]
             if isinstance(verdict, Proven):
                 condition = f", given {verdict.given}" if verdict.given else ""
-                search.trials.append(Result(prop, verdict.reason + condition, is_proven=True))
+                search.trials.append(Result(prop, verdict.reason + condition, verdict.by))
             else:
                 search.trials.append(Result(prop, doubts=verdict.rules))
+        search.prove()
         return search
+
+    def prove(self) -> None:
+        """Prove by induction what the ledger leaves open. What may be broken is tried on worlds that show how, if they can."""
+        trials = [trial for trial in self.undecided if trial.prop.owner != AUTOMATIC]
+        claims = [(trial.prop.claim, trial.prop.without) for trial in trials]
+        if not claims or not self.plan.proof:
+            return
+        ruleset, seconds = self.runner.ruleset, self.plan.proof
+        results = persistent(
+            f"proofs of {ruleset.name}",
+            repr((ruleset.text_key, seconds, [trial.prop.text for trial in trials])),
+            lambda: judgments(ruleset, claims, seconds),  # type: ignore[arg-type]
+        )
+        for trial, judgment in zip(trials, results, strict=True):
+            trial.proof, trial.reason = "induction" if judgment.is_proven else "", judgment.reason
+            if judgment.model is not None:
+                search = replace(self, trials=[trial])
+                for sample, _, steps in starts(judgment.model, ruleset):
+                    if trial.sample is None:
+                        search.try_sample(sample, steps)
 
     @property
     def undecided(self) -> list[Result]:
@@ -100,7 +137,8 @@ class InvariantSearch:
 
     def only(self, texts: Collection[str]) -> Self:
         """The same search for some properties alone that are not proven."""
-        return replace(self, trials=[replace(trial) for trial in self.undecided if trial.prop.text in texts])
+        trials = [trial for trial in self.trials if not trial.is_proven and trial.prop.text in texts]
+        return replace(self, trials=list(map(replace, trials)))
 
     def try_random(self) -> None:
         """Try random worlds until there are enough of them, or time is up."""
@@ -175,16 +213,18 @@ class InvariantSearch:
             if alone is None:
                 continue
             some = [(trial, world) for trial, world in broken if trial.prop.scope == scope]
-            search = self.of(self.runner.of(alone), self.plan, declared_only=True)
-            search = search.only([trial.prop.text for trial, _ in some])
+            texts = [trial.prop.text for trial, _ in some]
+            search = self.of(self.runner.of(alone), self.plan, declared_only=True, texts=texts)
             for _, world in some:
                 sample = translated(world.sample, ruleset, alone)
                 if sample is not None:
                     search.try_sample(sample, world.steps)
             search.try_random()
             still = {trial.prop.text for trial in search.trials if trial.sample is not None}
+            proven = {trial.prop.text for trial in search.trials if trial.is_proven}
             for trial, world in some:
                 if trial.prop.text not in still:
+                    trial.reason = "which is proven" if trial.prop.text in proven else "as far as was tried"
                     trial.difference = difference(trial.prop, ruleset, world)
 
 
@@ -230,13 +270,10 @@ FEW = 4
 """A set of this many elements or more does not show what a line is about."""
 
 
-def refuted(ruleset: Ruleset, ledger: Ledger) -> tuple[Diagnostic, ...]:
-    """An error for each invariant that a world breaks, a note for each that only added packs break.
-
-    The same rules give the same worlds.
-    """
+def refuted(ruleset: Ruleset, results: Sequence[Result]) -> tuple[Diagnostic, ...]:
+    """An error for each invariant that a world breaks, a note for each that only added packs break."""
     reporter = Reporter()
-    for result in quick_results(ruleset, ledger):
+    for result in results:
         if result.counterexample is None:
             continue
         world = [line for line in counterexample_lines(result.counterexample, ruleset) if line[:3] != "by "]
@@ -278,7 +315,7 @@ def _report_difference(
             *(Label(span, "did it") for span in rules[:2]),
             Label(result.prop.span, f"`{result.prop.owner}` says so"),
         ],
-        notes=["the packs that it speaks of keep it, as far as was tried", *world],
+        notes=[f"the packs that it speaks of keep it, {result.reason}", *world],
     )
 
 
@@ -301,9 +338,13 @@ class QuickSearch(InvariantSearch):
                     replace(self, trials=[trial]).try_sample(replace(sample, ids=ids, fields={}), QUICK_STEPS)
 
 
-def quick_results(ruleset: Ruleset, ledger: Ledger) -> list[Result]:
-    """Judge each invariant by a proof or a few worlds; a world that breaks an invariant is made small."""
-    search = QuickSearch.of(Oracle(ruleset), SearchPlan(), declared_only=True, ledger=ledger)
+def quick_results(ruleset: Ruleset, ledger: Ledger, proof: float = PROOF) -> list[Result]:
+    """Judge each invariant by a proof or a few worlds; a world that breaks an invariant is made small.
+
+    The same rules give the same worlds. `proof`: as in SearchPlan.
+    """
+    plan = SearchPlan(proof=proof)
+    search = QuickSearch.of(Oracle(ruleset), plan, declared_only=True, ledger=ledger)
     search.try_random()
     return search.finish()
 

@@ -1,0 +1,56 @@
+"""What becomes of claims: proven, or perhaps broken in some moment of a step, or undecided."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from powderdsl.ir.bits import NotBits
+from powderdsl.model.types import Claim, Ruleset
+from powderdsl.prover.induction import Prover
+from powderdsl.prover.questions import Model
+from powderdsl.prover.solver import OutOfWork
+from powderdsl.prover.symbolic import Budget, Undecided, deep_recursion
+
+
+@dataclass(frozen=True)
+class Judgment:
+    """The result for a claim. `model` is a part of a world that breaks it if such a world can be reached."""
+
+    is_proven: bool
+    reason: str
+    model: Model | None = None
+
+
+def judgments(
+    ruleset: Ruleset, claims: Sequence[tuple[Claim, frozenset[int]]], seconds: float
+) -> list[Judgment]:
+    """Judge claims about worlds that start without some elements, one after the other.
+
+    `seconds` bounds the work for all of them: it is counted, so results are the same on every machine.
+    """
+    try:
+        with deep_recursion():
+            prover = Prover(ruleset, Budget.of(seconds))
+            spoiler = prover.well_formed()
+            if spoiler is not None:
+                return [Judgment(False, f"pass `{spoiler.name}` may leave the range of a field")] * len(
+                    claims
+                )
+            return [_judgment(prover, claim, without) for claim, without in claims]
+    except NotBits as error:
+        return [Judgment(False, f"bit planes cannot carry the rules: {error}")] * len(claims)
+    except (OutOfWork, Undecided):
+        return [Judgment(False, "the rules are too large for a proof")] * len(claims)
+
+
+def _judgment(prover: Prover, claim: Claim, without: frozenset[int]) -> Judgment:
+    try:
+        moment = prover.broken(claim, without)
+    except OutOfWork:
+        return Judgment(False, "a proof takes too long: `--prove SECONDS` allows more")
+    except Undecided as error:
+        return Judgment(False, f"no proof is known: {error}")
+    if moment is None:
+        return Judgment(True, "each pass keeps it")
+    return Judgment(False, f"pass `{moment.name}` may break it", moment.model)
