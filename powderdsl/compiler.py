@@ -144,6 +144,27 @@ def load_with_diagnostics(
     return model, remarks
 
 
+def load_with_claim(name: str, claim: str) -> Ruleset:
+    """Read rule files into a checked model whose only invariant is a claim. Raises CompileError, as `load` does."""
+    from powderdsl.model.check import check
+
+    reporter = Reporter()
+    packs, ruleset = read([name], reporter)
+    reporter.raise_if_errors()
+    needs = ", ".join(pack.name.text for pack in packs)
+    text = f"pack: {CLAIM}\nneeds: [{needs}]\ninvariants:\n  - {' '.join(claim.split())}\n"
+    decl = read_file(Source(CLAIM, text), reporter)
+    reporter.raise_if_errors()
+    assert isinstance(decl, PackDecl)
+    model = check([*packs, decl], ruleset, reporter, None, shipped_words)
+    reporter.raise_if_errors()
+    return replace(model, invariants=tuple(claim for claim in model.invariants if claim.pack == CLAIM))
+
+
+CLAIM = "command_line"
+"""The name of the pack of a claim that no file makes."""
+
+
 def _report_more(
     packs: Sequence[PackDecl], ruleset: RulesetDecl | None, reader: _Reader, palette: Palette | None
 ) -> None:

@@ -28,6 +28,7 @@ GROUPS = {
     "Rules": {
         "check": "Find all mistakes in rule files and tasks at once.",
         "test": "Run the tests of packs and check their invariants.",
+        "prove": "Prove that two rulesets do the same, or that a claim always holds.",
         "trace": "Explain a cell: which rule wrote it, and what the rule read.",
         "show": "List elements, reactions, passes and parameters, or describe a task.",
         "explain": "Explain a diagnostic code and how to fix it.",

@@ -14,6 +14,7 @@ from powderdsl.model.state import Slot, fresh_values, slots
 from powderdsl.model.types import Ruleset
 from powderdsl.prover.induction import HERE, Moment, growing_ranges
 from powderdsl.prover.net import Literal
+from powderdsl.prover.solver import OutOfWork
 from powderdsl.prover.symbolic import (
     Before,
     Budget,
@@ -92,21 +93,28 @@ def why_incomparable(first: Ruleset, second: Ruleset) -> str | None:
     return None
 
 
+def has_own_parameters(first: Side, second: Side) -> bool:
+    """True unless both have the same parameters, with the same defaults."""
+    known = second.names.params
+    mine = {p.name: (p.kind, p.default) for p in first.ruleset.params}
+    return mine != {known.get(p.name, p.name): (p.kind, p.default) for p in second.ruleset.params}
+
+
 def differs(first: Side, second: Side, budget: Budget) -> Difference | None:
     """None if two rulesets with the same state are proven equal, else the first difference of passes.
 
-    Where parameters have other values, each ruleset has its own. Raises Undecided, OutOfWork and NotBits.
+    Where parameters have other values, each ruleset has its own. Raises Undecided and NotBits.
     """
-    params = [[(p.kind, p.default) for p in side.ruleset.params] for side in (first, second)]
-    draws = [[s.bits for s in side.ruleset.streams] for side in (first, second)]
-    if len(draws[0]) == len(draws[1]) and draws[0] != draws[1]:
+    draws = {s.name: s.bits for s in first.ruleset.streams}
+    if any(draws.get(second.names.stream(s.name), s.bits) != s.bits for s in second.ruleset.streams):
         raise Undecided("draws of other sizes")
-    fixed = params[0] != params[1]
-    for numbers in _groups(first.program, second.program):
-        difference = _differ(first, second, numbers, budget, fixed)
-        if difference is not None:
-            return difference
-    return None
+    fixed = has_own_parameters(first, second)
+    try:
+        groups = _groups(first.program, second.program)
+        differences = (_differ(first, second, numbers, budget, fixed) for numbers in groups)
+        return next((difference for difference in differences if difference), None)
+    except OutOfWork:
+        raise Undecided("the proof takes too long") from None
 
 
 Numbers = tuple[tuple[int, ...], tuple[int, ...]]

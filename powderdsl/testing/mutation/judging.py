@@ -10,7 +10,7 @@ import os
 import re
 import signal
 from collections import Counter
-from collections.abc import Collection, Generator, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Generator, Iterable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, replace
@@ -26,9 +26,8 @@ from typing import ClassVar, Self
 import numpy as np
 
 from powderdsl.analysis.proofs import horizon
-from powderdsl.compiler import lower, read
+from powderdsl.compiler import read
 from powderdsl.diagnostics import CompileError, Diagnostic, Reporter, Severity, Source
-from powderdsl.ir.text import print_program
 from powderdsl.model.check import check
 from powderdsl.model.composition.names import needs_of
 from powderdsl.model.declarations import PackDecl, RulesetDecl, read_file
@@ -43,12 +42,13 @@ from powderdsl.syntax.yaml_tree import parse_yaml
 from powderdsl.system.interrupts import delay_signal
 from powderdsl.system.settings import fingerprint
 from powderdsl.system.writing import write_text
-from powderdsl.testing.generators.cases import Array, Start
+from powderdsl.testing.generators.cases import Array
 from powderdsl.testing.mutation.operators import Mutant, mutants_of
 from powderdsl.testing.pack_tests.runner import ANYTHING, SEEDS, field_rows, run_examples
+from powderdsl.testing.properties.comparison import Distinction, compare
 from powderdsl.testing.properties.outcomes import Property, Result
-from powderdsl.testing.properties.running import Runner, State, first_difference, random_samples, run_sample
-from powderdsl.testing.properties.search import STEPS, InvariantSearch, SearchPlan, Work, shrink_while
+from powderdsl.testing.properties.running import Runner, random_samples, run_sample
+from powderdsl.testing.properties.search import STEPS, InvariantSearch, SearchPlan
 
 Settings = tuple[tuple[str, str], ...]
 """Parameters and their values as text."""
@@ -119,10 +119,6 @@ class Original:
         return fingerprint(self.ruleset)
 
     @cached_property
-    def lowered(self) -> str:
-        return lowered(self.ruleset)
-
-    @cached_property
     def broken(self) -> frozenset[str]:
         """The words of invariants that it breaks itself: what more packs change says nothing about a mutant."""
         search = InvariantTrials.on(self.sim)
@@ -132,21 +128,6 @@ class Original:
 
 def warnings_of(diagnostics: tuple[Diagnostic, ...]) -> Counter[str]:
     return Counter(diagnostic.code for diagnostic in diagnostics if diagnostic.severity is Severity.WARNING)
-
-
-def lowered(ruleset: Ruleset) -> str:
-    """The optimized program as text, with all that it reads: equal texts compute equal worlds."""
-    lines = [line.partition("#")[0] for line in print_program(lower(ruleset)).splitlines()]
-    fixed = (
-        [(e.name, e.id) for e in ruleset.elements],
-        [(p.name, p.values, sorted(p.stored)) for p in ruleset.properties],
-        [
-            (f.name, f.kind, f.default, f.at, f.resets, sorted(f.of) if f.of is not None else None)
-            for f in ruleset.fields
-        ],
-        [(p.name, p.kind, p.default) for p in ruleset.params],
-    )
-    return "\n".join([*lines, repr(fixed)])
 
 
 # Verdicts
@@ -159,6 +140,9 @@ AT_ONCE = "torch"
 
 FEW_STEPS = 20
 """Tests of at most this many steps run before longer ones."""
+
+PROOF = 30.0
+"""Seconds of work, counted, for a proof that a mutant is equal."""
 
 PAIRED = 6
 """Batches of worlds on which invariants are tried that compare several runs."""
@@ -205,8 +189,6 @@ def judge(original: Original, mutant: Mutant) -> Verdict:
     if failed is not None:
         by = "generated" if is_generated(failed) else "test"
         return Verdict("killed", by, f"{failed.pack}: {failed.name}")
-    if lowered(ruleset) == original.lowered:  # after the tests: few mutants come this far
-        return Verdict("equivalent", "the same program")
     return Verdict("survived")
 
 
@@ -293,7 +275,6 @@ def run_campaign(
     numbers: list[int],
     jobs: int,
     seed: int,
-    worlds: bool = True,
     settings: Settings = (),
 ) -> Generator[tuple[int, Verdict]]:
     """Yield numbers of mutants with their verdicts as they are judged.
@@ -302,14 +283,13 @@ def run_campaign(
 
     Args:
         numbers: places of the mutants among those of `Original.mutants`.
-        worlds: look for a world that shows each survivor.
         settings: other values for parameters.
 
     Raises:
         OSError: a process was killed, as where memory is short.
     """
     _loaded.cache_clear()  # files may have changed since
-    judged = partial(work, rules, settings, packs, seed, worlds)
+    judged = partial(work, rules, settings, packs, seed)
     if jobs == 1:
         yield from map(judged, numbers)
         return
@@ -348,22 +328,23 @@ def _loaded(rules: str, settings: Settings, packs: tuple[str, ...]) -> tuple[Ori
 
 
 def work(
-    rules: str, settings: Settings, packs: tuple[str, ...], seed: int, worlds: bool, number: int
+    rules: str, settings: Settings, packs: tuple[str, ...], seed: int, number: int
 ) -> tuple[int, Verdict]:
     """Judge the mutant of this number among all of a composition."""
     original, mutants = _loaded(rules, settings, packs)
     mutant = mutants[number]
     verdict = judge(original, mutant)
-    if verdict.status != "survived" or not worlds:
+    mutated = original.mutated(mutant) if verdict.status == "survived" else None
+    if mutated is None:
         return number, verdict
-    mutated = original.mutated(mutant)
-    assert mutated is not None
-    sim = compile(mutated[0], backend=starting_backend("cpu"))
-    world = distinguish(original.sim, sim, focused(original, mutant), seed)
-    if world is None:
+    sim = compile(mutated[0], backend=starting_backend("cpu"))  # few mutants come this far
+    comparison = compare(original.sim, sim, PROOF, focused(original, mutant), seed)
+    if comparison.status == "equal":
+        return number, Verdict("equivalent", "a proof")
+    if comparison.distinction is None:
         return number, verdict
-    test = written_test(mutant, world, original.sim, original.packs)
-    return number, replace(verdict, differs_in=world.slot, test=test)
+    test = written_test(mutant, comparison.distinction, original.sim, original.packs)
+    return number, replace(verdict, differs_in=comparison.distinction.slot, test=test)
 
 
 def focused(original: Original, mutant: Mutant) -> tuple[int, ...]:
@@ -539,81 +520,3 @@ def add_tests(path: Path, tests: Sequence[GeneratedTest]) -> None:
     """Write more tests into a pack's file, whole or not at all."""
     path = path.resolve()
     write_text(path, with_tests(Source(str(path), path.read_text(encoding="utf-8")), tests))
-
-
-COMPARED = 6144
-"""Random worlds on which a mutant is compared with the original."""
-
-RUN_STEPS = (2, 4, 8, 16, 48)
-"""How many steps batches run, one after the other."""
-
-TRIED_SEEDS = 16
-"""With how many seeds a smaller world is tried."""
-
-WORK = 1_000_000_000
-"""Work for making a world smaller, see `testing.properties.search`."""
-
-
-@dataclass(frozen=True)
-class Distinction:
-    """One world on which two compositions differ after some steps: in `slot`, if not already in elements.
-
-    `first` and `second` are the states after the last step.
-    """
-
-    sample: Start
-    steps: int
-    slot: str
-    first: State
-    second: State
-
-
-def distinguish(
-    first: Simulator, second: Simulator, focus: Sequence[int] = (), seed: int = 0
-) -> Distinction | None:
-    """A small world on which two simulators differ, or None if none was found.
-
-    Half of the worlds are made of elements `focus`, ids that are likely to matter. Equal seeds give the same worlds.
-    """
-    known = {slot.name for slot in second.slots}
-    names = tuple(slot.name for slot in first.slots if slot.name in known)
-    tries = TRIED_SEEDS if first.ruleset.streams or second.ruleset.streams else 1
-
-    def states(sample: Start, steps: int) -> tuple[list[State], list[State]]:
-        return run_sample(first, sample, steps)[0], run_sample(second, sample, steps)[0]
-
-    def differs(compared: Sequence[str], sample: Start, steps: int) -> Array:
-        return first_difference(*states(sample, steps), compared)
-
-    for compared in (names[:1], names):  # the worlds' elements show more than their fields
-        for sample, steps in _samples(first, second, focus, seed):
-            when = differs(compared, sample, steps)
-            if not when.any():
-                continue
-            soonest = int(np.where(when > 0, when, steps + 1).argmin())
-            small, steps = shrink_while(
-                partial(differs, compared),
-                sample.one(soonest),
-                int(when[soonest]),
-                tries,
-                Work(first.ruleset, WORK),
-            )
-            if tries == 1:
-                small = replace(small, seed=np.zeros_like(small.seed))
-            mine, theirs = (ran[-1] for ran in states(small, steps))
-            slot = next(name for name in compared if (mine[name] != theirs[name]).any())
-            return Distinction(small, steps, slot, mine, theirs)
-    return None
-
-
-def _samples(
-    first: Simulator, second: Simulator, focus: Sequence[int], seed: int
-) -> Iterator[tuple[Start, int]]:
-    """Worlds with the usual parameters, and how many steps they run. Every other batch is made of `focus` alone."""
-    kinds, same = np.array(focus, np.uint8), set(first.slots) == set(second.slots)
-    batches = zip(random_samples(first.ruleset, seed, COMPARED), cycle(RUN_STEPS), strict=False)
-    for number, (sample, steps) in enumerate(batches):
-        sample = replace(sample, params={}, step=np.zeros_like(sample.step))
-        if number % 2 and len(kinds) > 1:
-            sample = replace(sample, ids=kinds[sample.ids % len(kinds)], fields={})
-        yield sample if same else replace(sample, fields={}), steps

@@ -146,25 +146,31 @@ def counterexample_lines(counterexample: Counterexample, ruleset: Ruleset) -> It
     yield f"broken at row {counterexample.cell[0]}, column {counterexample.cell[1]}, after {steps} with seed {int(counterexample.sample.seed[0])}"
     for span in counterexample.culprits:
         yield f"by {place_of(span)}: {one_line(span)}"
+    states = {"before": counterexample.before["element"], "after": counterexample.after["element"]}
+    yield from world_lines(counterexample.sample, states, ruleset)
+
+
+def world_lines(sample: Start, states: Mapping[str, Array], ruleset: Ruleset) -> Iterator[str]:
+    """Ids [H, W] by title, side by side, and what else the start world holds."""
     glyphs = {element.id: element.glyph for element in ruleset.elements}
     columns = [
         [title, *(" ".join(glyphs.get(number, "?") for number in row) for row in ids[:MAX_DRAWN, :MAX_DRAWN].tolist())]
-        for title, ids in (("before", counterexample.before["element"]), ("after", counterexample.after["element"]))
+        for title, ids in states.items()
     ]  # fmt: skip
     yield from side_by_side(columns)
     names = {element.id: element.name for element in ruleset.elements}
-    there = np.unique([counterexample.before["element"], counterexample.after["element"]]).tolist()
+    there = sorted({number for ids in states.values() for number in np.unique(ids).tolist()})
     yield ", ".join(f"{glyphs[number]} {names[number]}" for number in there if number in names)
     for slot in slots(ruleset):
-        values = counterexample.sample.fields.get(slot.name)
-        if values is None or np.array_equal(values, fresh(ruleset, slot, counterexample.sample.ids)):
+        values = sample.fields.get(slot.name)
+        if values is None or np.array_equal(values, fresh(ruleset, slot, sample.ids)):
             continue  # as in fresh cells
         text = " / ".join(" ".join(row) for row in field_words(ruleset, slot.kind, values[0]))
         yield f"{slot.name}: {text if len(text) <= MAX_TEXT else f'{text[:MAX_TEXT]} …'}"
-    for name, values in counterexample.sample.params.items():
+    for name, values in sample.params.items():
         yield f"{name} = {float(values[0]):g}"
-    if counterexample.sample.step.any():
-        yield f"the clock says {int(counterexample.sample.step[0])}"
+    if sample.step.any():
+        yield f"the clock says {int(sample.step[0])}"
 
 
 def side_by_side(columns: Sequence[Sequence[str]]) -> Iterator[str]:

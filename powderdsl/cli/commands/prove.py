@@ -1,0 +1,111 @@
+"""`powderdsl prove`: whether two rulesets are equal, and whether a claim holds in every world."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import click
+
+from powderdsl.cli import options as opt
+from powderdsl.cli.exits import FAILED, OK, BadInput
+from powderdsl.cli.output import counted, print_json
+from powderdsl.compiler import load, load_with_claim
+from powderdsl.model.types import Ruleset
+
+
+@click.command("prove", cls=opt.Command)
+@click.argument("words", nargs=-1, required=True, metavar="A == B | RULES CLAIM")
+@opt.proof
+@opt.option("--json", bool, "Print one JSON object.", to="as_json")
+def command(words: tuple[str, ...], prove: int, as_json: bool) -> int:
+    """Prove that two rulesets do the same, or that a claim holds in every world.
+
+    A and B are RULES, or one pass of them, as in powderworld:flow. Elements, fields, parameters and streams match by
+    name. If A and B differ, a small world shows it. CLAIM is written as an invariant in a rule file.
+
+    \b
+        powderdsl prove mine.yaml == life
+        powderdsl prove mine.yaml "mirrored worlds agree"
+
+    Exit code: 0 if it is proven, 1 if it is refuted or undecided, 2 for bad rules.
+    """
+    text = " ".join(words)
+    sides = text.split(" == ") if "==" in words else re.findall(r"\S+", text.replace(" == ", " "))
+    if "==" in words or re.fullmatch(r"\S+ == \S+", text):
+        if len(sides) != 2:
+            raise BadInput("write two rulesets: A == B")
+        first, second = sides
+        status, lines, data = _compared(first, second, prove)
+    elif len(words) < 2:
+        raise BadInput(
+            'write `A == B`, or rules and a claim, such as: powderdsl prove life "mirrored worlds agree"'
+        )
+    else:
+        status, lines, data = _claimed(words[0], " ".join(words[1:]), prove)
+    if as_json:
+        print_json({"status": status, **data})
+    else:
+        click.echo("\n".join(lines))
+    return OK if status in ("equal", "proven") else FAILED
+
+
+Answer = tuple[str, list[str], dict[str, Any]]
+"""A status, lines of text, and the same as JSON."""
+
+
+def _compared(first: str, second: str, seconds: int) -> Answer:
+    from powderdsl.testing.properties.comparison import compare_rules
+    from powderdsl.testing.properties.outcomes import world_lines
+
+    (_, mine), (other, theirs) = map(_side, (first, second))
+    result = compare_rules(mine, other, theirs, seconds)
+    lines = [
+        f"{result.status}: {first} == {second} ({result.reason})",
+        *(f"  given: {words}" for words in result.given),
+    ]
+    data: dict[str, Any] = {"reason": result.reason, "given": list(result.given)}
+    if (shown := result.distinction) is not None:
+        steps = counted(shown.steps, "step")
+        lines.append(f"  in {shown.slot}, after {steps} with seed {int(shown.sample.seed[0])}")
+        ids = {"before": shown.sample.ids, "first": shown.first["element"], "second": shown.second["element"]}
+        states = {title: values[0] for title, values in ids.items()}
+        lines += [f"  {line}" for line in world_lines(shown.sample, states, mine)]
+        data |= {title: values.tolist() for title, values in states.items()}
+        data |= {"steps": shown.steps, "slot": shown.slot, "seed": int(shown.sample.seed[0])}
+        if shown.slot != "element":
+            fields = {
+                title: state[shown.slot][0].tolist()
+                for title, state in (("A", shown.first), ("B", shown.second))
+            }
+            lines += [f"  {shown.slot} in {title}: {values}" for title, values in fields.items()]
+            data["fields"] = fields
+    return result.status, lines, data
+
+
+def _side(text: str) -> tuple[str, Ruleset]:
+    """The RULES that a side names, and their model, of one pass if it names one."""
+    rules, colon, word = text.rpartition(":")
+    if not colon or Path(text).exists() or not re.fullmatch(r"\w+", word):
+        return text, load(text)
+    ruleset = load(rules)
+    passes = tuple(pass_ for pass_ in ruleset.passes if pass_.name == word)
+    if not passes:
+        known = ", ".join(pass_.name for pass_ in ruleset.passes)
+        raise BadInput(f"no pass `{word}` in {rules}: it has {known}")
+    return rules, replace(ruleset, passes=passes)
+
+
+def _claimed(rules: str, claim: str, seconds: int) -> Answer:
+    from powderdsl.analysis.ledger import ledger
+    from powderdsl.testing.properties.outcomes import counterexample_lines, result_data, result_line
+    from powderdsl.testing.properties.search import quick_results
+
+    ruleset = load_with_claim(rules, claim)
+    (result,) = quick_results(ruleset, ledger(ruleset), seconds)
+    lines = [result_line(result)]
+    if result.counterexample is not None:
+        lines += [f"      {line}" for line in counterexample_lines(result.counterexample, ruleset)]
+    return result.status, lines, result_data(result)

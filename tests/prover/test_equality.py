@@ -1,0 +1,47 @@
+"""Equality of rulesets: rewrites are proven, and what differs is shown by a world."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from powderdsl.compiler import load
+from powderdsl.prover.equality import Side, differs, why_incomparable
+from powderdsl.prover.symbolic import Budget, deep_recursion
+from powderdsl.testing.generators.cases import Start
+from powderdsl.testing.properties.running import Oracle
+from tests.semantics.texts import load_text
+
+
+def test_the_start_of_cells_belongs_to_a_ruleset() -> None:
+    """A stored property that only fresh cells show: passes are equal, worlds are not."""
+    rules = load("powderworld")
+    gravity, cloner = rules.property("gravity"), rules.element("cloner").id
+    assert gravity is not None
+    values = [not value if number == cloner else value for number, value in enumerate(gravity.values)]
+    changed = replace(gravity, values=tuple(values))
+    mutant = replace(rules, properties=tuple(changed if p is gravity else p for p in rules.properties))
+    ids = np.array([[1, 1, 1], [1, cloner, 1], [1, 0, 1], [1, 1, 1]], np.uint8)
+    ends = [Oracle(model).states(Start.fresh(ids), 1)[1]["element"] for model in (rules, mutant)]
+    assert (ends[0] != ends[1]).any()
+    assert why_incomparable(rules, rules) is None
+    assert "gravity" in (why_incomparable(rules, mutant) or "")
+
+
+def test_a_wider_range_is_compared_under_the_narrower_one() -> None:
+    pack = """
+pack: clock
+elements: {tick: {id: 0, color: "#000000"}}
+fields: {age: {type: 0..RANGE, at: place}}
+passes:
+  grow:
+    do: age := min(age + 1, 5)
+"""
+    few, many, more = (load_text(pack.replace("RANGE", most)) for most in ("5", "9", "100"))
+    with deep_recursion():
+        assert differs(Side.of(few), Side.of(many), Budget.of(10)) is None
+        assert differs(Side.of(more), Side.of(few), Budget.of(10)) is None
+    short = load_text(pack.replace("RANGE", "4"))
+    with deep_recursion():
+        assert differs(Side.of(few), Side.of(short), Budget.of(10)) is not None
