@@ -4,19 +4,20 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from threading import get_ident
-from types import FunctionType
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
 from powderdsl.ir.ops import REAL, Program, nodes_of
+from powderdsl.system.cache import collection_paused
 from powderdsl.system.random import base_keys
 from powderdsl.targets.job import Job, Like, PackedArrays, like_of, shape_of
 from powderdsl.targets.layout import limits, pieces
 from powderdsl.targets.torch.library import Eager, Portable
-from powderdsl.targets.torch.planes import Key, Source, pass_source
+from powderdsl.targets.torch.planes import Key, pass_source
 from powderdsl.targets.torch.program import step_keys
 from powderdsl.targets.torch.source import load_source
 
@@ -72,7 +73,8 @@ class PlanesProgram:
         idents = [ident for name, ident, _ in planes.streams if name in self._bits]
         self._idents = torch.tensor(idents, dtype=torch.int64, device=device)
         self._sources = [pass_source(planes, pass_, i) for i, pass_ in enumerate(planes.passes)]
-        self._functions = [self._function(source) for source in self._sources]
+        known = {"inf": float("inf"), "nan": float("nan")}
+        self._functions = [load_source(source.text, source.name, known) for source in self._sources]
         self._kernels: dict[tuple[int, int, int, int], _Kernels] = {}
         self._settings: tuple[Any, list[dict[Key, Any]]] | None = None
         """The parameters of the last job, and the inputs of passes that depend on them, by chunk."""
@@ -100,9 +102,6 @@ class PlanesProgram:
                 chunks.append(self._steps(kernels, chunk, job, base, step, settings[1][number]))
         return PlanesState(self, chunks, like)
 
-    def _function(self, source: Source) -> Callable[..., Batch]:
-        return load_source(source.text, source.name, {"inf": float("inf"), "nan": float("nan")})
-
     def _sized(self, batch: int, height: int, width: int) -> _Kernels:
         # The eager library has memory that threads must not share.
         key = (batch, height, width, get_ident() if self.eager else 0)
@@ -110,14 +109,14 @@ class PlanesProgram:
             if len(self._kernels) >= MOST_SIZES:
                 self._kernels.clear()
             k = (Eager if self.eager else Portable)(batch, height, width, self.device)
-            draw, functions = _draw, self._functions
+            draw: Callable[..., Any] = partial(_draw, tuple(self._bits.values()))
+            functions = [draw, *self._functions]
             if self._fuse:
-                from powderdsl.targets.torch.fuse import fused  # takes seconds to import
+                with collection_paused():
+                    from powderdsl.targets.torch.fuse import fused  # takes seconds to import
 
-                # A function that is compiled for too many sizes is refused: each size has its own.
-                functions = [fused(self._function(source)) for source in self._sources]
-                draw = fused(FunctionType(_draw.__code__.replace(), globals()))
-            self._kernels[key] = _Kernels(k, draw, functions)
+                functions = list(map(fused, functions))
+            self._kernels[key] = _Kernels(k, functions[0], functions[1:])
         return self._kernels[key]
 
     def _steps(
@@ -130,8 +129,7 @@ class PlanesProgram:
         for i in range(job.steps):
             step = start + i
             values = k.fixed | settings
-            bits = tuple(self._bits.values())
-            drawn = kernels.draw(k, base, step, self._idents, bits) if bits else ()
+            drawn = kernels.draw(k, base, step, self._idents) if self._bits else ()
             for stream, planes in zip(self._bits, drawn, strict=True):
                 values["draws", stream] = planes.unbind() if self.eager else planes
             for key in self._keys("step"):
@@ -217,7 +215,7 @@ class PlanesProgram:
         return whole.to(dtype).contiguous()
 
 
-def _draw(k: Portable, base: Tensor, step: Tensor, idents: Tensor, bits: Sequence[int]) -> tuple[Tensor, ...]:
+def _draw(bits: Sequence[int], k: Portable, base: Tensor, step: Tensor, idents: Tensor) -> tuple[Tensor, ...]:
     """The draws of each stream in a step, from its number and the bits it needs."""
     keys = step_keys(base, step, idents).to(torch.int32)
     return tuple([k.draws(keys[i], count) for i, count in enumerate(bits)])
