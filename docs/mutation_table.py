@@ -54,17 +54,14 @@ def packs_of(rules: str) -> list[str]:
     return [pack.name.text for pack in packs if not only or pack.name.text in only]
 
 
-def count(rules: str, packs: Sequence[str], jobs: int, worlds: bool = False) -> Iterator[Counts]:
-    """Tallies of some packs of a composition, each as soon as all of its mutants are judged.
-
-    `worlds`: also look for worlds that show survivors, which takes longer.
-    """
+def count(rules: str, packs: Sequence[str], jobs: int) -> Iterator[Counts]:
+    """Tallies of some packs of a composition, each as soon as all of its mutants are judged."""
     from powderdsl.testing.mutation.judging import Original, Verdict, run_campaign, tally
 
     mutants = Original.of(rules).mutants(frozenset(packs))
     left = Counter(mutant.pack for mutant in mutants)
     found: dict[str, list[Verdict]] = {pack: [] for pack in packs}
-    for number, verdict in run_campaign(rules, tuple(packs), list(range(len(mutants))), jobs, 0, worlds):
+    for number, verdict in run_campaign(rules, tuple(packs), list(range(len(mutants))), jobs, 0):
         pack = mutants[number].pack
         found[pack].append(verdict)
         left[pack] -= 1

@@ -10,7 +10,7 @@ import pytest
 from powderdsl.compiler import read, shipped_tests, shipped_variants
 from powderdsl.diagnostics import Reporter, Source
 from powderdsl.model.declarations import read_file
-from powderdsl.testing.mutation.operators import mutants_of
+from powderdsl.testing.mutation.operators import mutants_of, names_of
 from tests.tiers import tiered
 
 PACK = """\
@@ -124,3 +124,28 @@ def test_shipped_mutants_are_rule_files(rules, every):
             if reporter.has_errors:
                 unreadable.append(mutant.diff)
         assert not unreadable
+
+
+def test_a_name_stands_only_for_names_that_hold_the_same() -> None:
+    text = """\
+pack: kinds
+elements: {soil: {id: 0, color: "#101010"}}
+fields:
+  damp: {type: 0..9, at: place}
+  wet: {type: flag, at: place}
+  warm: {type: -3..3, at: place}
+  wind: {type: vec2(-1..1), at: place}
+  storm: {type: vec2(-5..5), at: place}
+params: {growth: 5%, decay: 10%, limit: 3}
+"""
+    pack = read_file(Source("kinds.yaml", text), Reporter())
+    names = names_of([pack], pack)
+    others = {name: names.others(name) for name in ("damp", "wet", "warm", "wind", "growth", "limit")}
+    assert others == {
+        "damp": ["warm"],
+        "wet": [],
+        "warm": ["damp"],
+        "wind": ["storm"],
+        "growth": ["decay"],
+        "limit": [],
+    }

@@ -193,3 +193,14 @@ def test_warnings_that_a_pack_deserves_stay_warnings() -> None:
     write(pool=POOL.replace('reed: {color: "#30A030"}', 'reed: {color: "#30A030", tags: wet}'))
     _, remarks = load_with_diagnostics("core+pool.yaml+grit.yaml")
     assert [one.code for one in remarks if one.severity is Severity.WARNING] == ["PD514"]
+
+
+def test_rules_are_equal_wherever_they_stand_in_their_file() -> None:
+    model = library.load("core+grit.yaml")
+    Path("grit.yaml").write_text("# a comment\n\n" + Path("grit.yaml").read_text())
+    moved = library.load("core+grit.yaml")
+    assert model.tests
+    assert model.invariants
+    assert (model.tests, model.invariants, model.passes) == (moved.tests, moved.invariants, moved.passes)
+    assert repr(model.tests) == repr(moved.tests)
+    assert model.text_key != moved.text_key  # messages name places
