@@ -9,7 +9,7 @@ from typing import Any
 from powderdsl.ir.ops import OPS, Threshold
 from powderdsl.prover.net import FALSE, TRUE, Literal
 from powderdsl.prover.solver import OutOfWork, Solver
-from powderdsl.prover.symbolic import Cell, Symbols, Term
+from powderdsl.prover.symbolic import LEAVES, Cell, Symbols, Term
 
 
 @dataclass(frozen=True)
@@ -161,7 +161,7 @@ class Questions:
             return TRUE
         key = (min(a, b), max(a, b))
         if key not in self.same:
-            self.same[key] = self.net.variable("same", *key)
+            self.same[key] = self.symbols.about("same", *key)
         return self.same[key]
 
     def _refine(self, concerned: Sequence[int]) -> bool:
@@ -216,7 +216,3 @@ class Questions:
             else:
                 resolved[term] = term, frozenset()
         return resolved[term]
-
-
-LEAVES = ("const", "param", "draw")
-"""Operations whose terms have no parts."""

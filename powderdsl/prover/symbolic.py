@@ -21,6 +21,9 @@ from powderdsl.prover.solver import OutOfWork
 
 NAMELESS = ("",)
 
+LEAVES = ("const", "param", "draw")
+"""Operations whose terms have no parts."""
+
 Term = int
 """The number of a float term."""
 
@@ -62,6 +65,7 @@ class Terms:
     def __init__(self) -> None:
         self.terms: list[tuple[object, ...]] = []
         self._numbers: dict[tuple[object, ...], Term] = {}
+        self._choices: dict[Term, frozenset[int]] = {}
 
     def leaf(self, *name: object) -> Term:
         """A constant, a parameter, a draw or the content of a slot."""
@@ -77,6 +81,15 @@ class Terms:
         """The value of a constant."""
         kind, value, *_ = self.terms[term]
         return value if kind == "const" else None  # type: ignore[return-value]
+
+    def choices(self, term: Term) -> frozenset[int]:
+        """The gates that decide which of its parts a term is."""
+        if term not in self._choices:
+            kind, attr, *args = self.terms[term]
+            parts: list[Any] = args if kind == "select" or (kind in OPS and kind not in LEAVES) else []
+            own = [attr >> 1] if kind == "select" else []  # type: ignore[operator]
+            self._choices[term] = frozenset(own).union(*map(self.choices, parts))
+        return self._choices[term]
 
     def choose(self, condition: Literal, yes: Term, no: Term) -> Term:
         if condition & 1:
@@ -241,8 +254,14 @@ class Symbols:
             return int(bool(OPS[op].value(None, left, right)))
         key = (op, a, b)
         if key not in self.comparisons:
-            self.comparisons[key] = self.net.variable("comparison", *key)
+            self.comparisons[key] = self.about("comparison", *key)
         return self.comparisons[key]
+
+    def about(self, *name: Any) -> Literal:
+        """A variable about two floats, the end of its name: what they are depends on the gates that choose their parts."""
+        literal = self.net.variable(*name)
+        self.net.inputs[literal >> 1] = (*frozenset().union(*map(self.terms.choices, name[-2:])),)
+        return literal
 
     def cells_read(self, gates: Iterable[int]) -> dict[Cell, dict[str, None]]:
         """The cells of worlds of variables that are among some gates, with the planes that are read there."""
