@@ -187,7 +187,8 @@ def run_console(block: Block) -> None:
             seen = line.strip() in ("", "…") or line.rstrip() in printed
             assert seen, f"not printed: {line}\n{printed}"
         elif line.startswith("$ powderdsl "):
-            status = 2 if "error[PD" in block.text else 0
+            fails = re.search(r"^(differ:|BROKEN)", block.text, re.MULTILINE)
+            status = 2 if "error[PD" in block.text else 1 if fails else 0
             printed = run_command(shlex.split(line.removeprefix("$ powderdsl "), comments=True), status)
             printed = printed.replace(f"{ROOT}/", "")  # as seen from the repository
 

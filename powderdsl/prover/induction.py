@@ -9,7 +9,8 @@ from functools import cached_property, partial
 from powderdsl.compiler import lower
 from powderdsl.ir.bits import lower_pass
 from powderdsl.ir.lower import lower_condition
-from powderdsl.ir.ops import Node, Offset, Program, needed
+from powderdsl.ir.ops import Node, Offset, PassGraph, Program, needed, nodes_of
+from powderdsl.model.state import slots
 from powderdsl.model.types import Bounded, Claim, Local, Never, Ruleset, Symmetric, Total, Unchanging
 from powderdsl.prover.net import FALSE, Literal
 from powderdsl.prover.questions import Model, Questions
@@ -20,6 +21,7 @@ from powderdsl.prover.symbolic import (
     Budget,
     Cell,
     Evaluation,
+    Names,
     Ranges,
     Reset,
     SubstepEvaluation,
@@ -221,10 +223,17 @@ class Prover:
                 return None
         raise Undecided("this kind of claim")
 
+    def _condition(self, claim: Never) -> Node:
+        """The condition of a claim on bit planes."""
+        graph = lower_pass(self.program, lower_condition(self.ruleset, claim.condition))
+        if _reads_clock(graph):  # it changes from step to step, not from pass to pass
+            raise Undecided("the clock")
+        ((_, condition),) = graph.outputs
+        return condition
+
     def _law(self, claim: Never | Bounded) -> Law:
         if isinstance(claim, Never):
-            graph = lower_pass(self.program, lower_condition(self.ruleset, claim.condition))
-            ((_, condition),) = graph.outputs
+            condition = self._condition(claim)
             return lambda moment, world, cell: moment.condition(condition, world, cell) ^ 1
         row = self.start.symbols.layouts.get(claim.field)
         if row is None:
@@ -262,16 +271,19 @@ class Prover:
 
     def _never_for(self, claim: Never, given: Sequence[Law]) -> Moment | None:
         """Whether a condition can hold in a cell for several steps in a row: whole steps, one after the other."""
-        symbols = self._symbols()
-        graph = lower_pass(self.program, lower_condition(self.ruleset, claim.condition))
-        ((_, condition),) = graph.outputs
+        if claim.steps > 2 and any(map(_reads_clock, self.planes)):
+            raise Undecided("the clock")
+        symbols, condition = self._symbols(), self._condition(claim)
         start: World = Before(symbols)
         moment = Moment("steps", symbols, (start,), start, start)
         world, holds = start, [moment.condition(condition, start, HERE)]
-        for _ in range(claim.steps - 1):
+        for step in range(claim.steps - 1):
+            names = Names(
+                streams={s.name: f"{s.name} {step}" for s in self.ruleset.streams}
+            )  # each step draws anew
             world = Reset(world, symbols)
             for pass_ in self.planes:
-                world = Evaluation(world, symbols).after(pass_.outputs)
+                world = Evaluation(world, symbols, names).after(pass_.outputs)
             holds.append(moment.condition(condition, world, HERE))
         return moment if moment.can_be(holds, given) else None
 
@@ -387,6 +399,8 @@ class Prover:
 
     def _symmetric(self, number: int, turn: str) -> Moment | None:
         """None if a pass gives the turned world for a turned world and turned draws."""
+        if any(slot.resets and slot.kind.name in ("direction", "vec2") for slot in slots(self.ruleset)):
+            raise Undecided("directions that are reset do not turn")
         before = Before(symbols := self._symbols())
         pass_, net = self.planes[number], symbols.net
         turned = Turned(before, symbols, turn)
@@ -398,6 +412,10 @@ class Prover:
         second = [plain.bit(plane, *HERE) for plane, _ in pass_.outputs]
         moment = Moment(pass_.name, symbols, (before,), before, plain, self.ranges[number])
         return moment if moment.can_be([net.any(map(net.xor, first, second))]) else None
+
+
+def _reads_clock(pass_: PassGraph) -> bool:
+    return any(node.op == "coordinate" and node.attr[0] == "step" for node in nodes_of(pass_))
 
 
 def _moves(writes: Iterable[tuple[str, Node]], known: Iterable[Node]) -> Iterator[tuple[Node, Offset]]:

@@ -95,3 +95,38 @@ def test_claims_are_proven_if_they_are_true(claim: str, breaks: str) -> None:
 def test_a_reach_that_is_too_short_is_not_decided() -> None:
     with pytest.raises(Undecided):
         verdicts(load_text(f"{PACK}  - nothing reaches beyond 0 cells\n"))
+
+
+CLOCK = """
+pack: clock
+elements:
+  dark: {id: 0, color: "#000000"}
+  light: {id: 1, color: "#FFFFFF"}
+fields:
+  heading: {type: direction, default: right, at: place, resets: step}
+streams: [luck]
+passes:
+  blink:
+    do:
+      - light -> dark if luck < 50%
+      - dark -> light if luck < 50%
+  turn:
+    do: light -> dark if heading is right and right is light
+invariants:
+"""
+
+
+@pytest.mark.parametrize(
+    ("claim", "is_proven"),
+    [
+        ("never (light and step mod 2 == 1)", False),  # it may be light at an even step
+        ("never light for 3 steps", False),  # each step draws anew
+        ("mirrored worlds agree", False),  # what is reset does not turn
+    ],
+)
+def test_what_changes_from_step_to_step_is_not_taken_for_the_same(claim: str, is_proven: bool) -> None:
+    try:
+        (moment,) = verdicts(load_text(f"{CLOCK}  - {claim}\n")).values()
+    except Undecided:
+        moment = "undecided"
+    assert (moment == "") == is_proven
