@@ -182,9 +182,22 @@ def equal_mutants(
 
 
 def differing_world(first: Ruleset, second: Ruleset, worlds: int, seed: int = 0) -> tuple[Start, int] | None:
-    """A world with the usual parameters on which two rulesets with the same state differ, and after how many steps."""
+    """A world with the usual parameters on which two rulesets with the same state differ, and after how many steps.
+
+    Its numbers lie in the ranges of both.
+    """
+    kinds = [{slot.name: slot.kind for slot in slots(ruleset)} for ruleset in (first, second)]
+    bounds = {
+        name: (max(kind.lo, kinds[1][name].lo), min(kind.hi, kinds[1][name].hi))
+        for name, kind in kinds[0].items()
+        if kind.name in ("int", "real", "vec2")
+    }
     for sample, steps in zip(random_samples(first, seed, worlds), cycle(STEPS), strict=False):
-        start = replace(sample, params={})
+        fields = {
+            name: np.clip(values, *bounds[name]).astype(values.dtype) if name in bounds else values
+            for name, values in sample.fields.items()
+        }
+        start = replace(sample, fields=fields, params={})
         when = first_difference(*(Oracle(ruleset).states(start, steps) for ruleset in (first, second)))
         if when.any():
             world = int(np.nonzero(when)[0][0])
