@@ -93,6 +93,12 @@ def why_incomparable(first: Ruleset, second: Ruleset) -> str | None:
     return None
 
 
+def narrowed(first: Ruleset, second: Ruleset) -> list[str]:
+    """The slots that hold fewer values in the second of two rulesets with the same slots."""
+    kinds = {slot.name: slot.kind for slot in slots(first)}
+    return [s.name for s in slots(second) if s.kind.lo > kinds[s.name].lo or s.kind.hi < kinds[s.name].hi]
+
+
 def has_own_parameters(first: Side, second: Side) -> bool:
     """True unless both have the same parameters, with the same defaults."""
     known = second.names.params

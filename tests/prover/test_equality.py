@@ -8,8 +8,10 @@ import numpy as np
 
 from powderdsl.compiler import load
 from powderdsl.prover.equality import Side, differs, why_incomparable
-from powderdsl.prover.symbolic import Budget, deep_recursion
+from powderdsl.prover.symbolic import Budget, Names, deep_recursion
+from powderdsl.simulation.simulator import compile
 from powderdsl.testing.generators.cases import Start
+from powderdsl.testing.properties.comparison import compare
 from powderdsl.testing.properties.running import Oracle
 from tests.semantics.texts import load_text
 
@@ -45,3 +47,20 @@ passes:
     short = load_text(pack.replace("RANGE", "4"))
     with deep_recursion():
         assert differs(Side.of(few), Side.of(short), Budget.of(10)) is not None
+
+
+def test_a_mutant_that_holds_fewer_values_is_not_equal() -> None:
+    pack = """
+pack: store
+elements: {shelf: {id: 0, color: "#000000"}}
+fields: {full: {type: 0..MOST, at: place}, mark: {type: flag, at: place}}
+passes:
+  look:
+    do: mark := yes where full > 90
+"""
+    sims = {most: compile(load_text(pack.replace("MOST", most)), "wasm") for most in ("5", "9")}
+    assert compare(sims["5"], sims["9"], 10).status == "equal"
+    assert compare(sims["9"], sims["5"], 10).status != "equal"
+    shared = compare(sims["9"], sims["5"], 10, names=Names())
+    assert shared.status == "equal"
+    assert shared.given == ("`full` starts with what both can hold",)

@@ -11,7 +11,7 @@ from powderdsl.arrays import np
 from powderdsl.compiler import load
 from powderdsl.ir.bits import NotBits
 from powderdsl.model.types import Ruleset
-from powderdsl.prover.equality import Side, differs, has_own_parameters, why_incomparable
+from powderdsl.prover.equality import Side, differs, has_own_parameters, narrowed, why_incomparable
 from powderdsl.prover.questions import Model
 from powderdsl.prover.symbolic import Budget, Names, Undecided, deep_recursion
 from powderdsl.simulation.simulator import Simulator, compile
@@ -71,9 +71,13 @@ def compare(
 ) -> Comparison:
     """Prove that two rulesets are equal, or, with `search`, find a small world on which they differ.
 
-    `seconds` of work go into the proof. `names` are the first one's names of the other's parameters and streams.
+    `seconds` of work go into the proof. `names` are the first one's names of the other's parameters and streams, if that has
+    other files; otherwise all worlds of the first count.
     """
     model, reason = None, why_incomparable(first.ruleset, second.ruleset)
+    fewer = [] if reason else narrowed(first.ruleset, second.ruleset)
+    if fewer and names is None:
+        reason = f"`{fewer[0]}` holds fewer values"
     if reason is None:
         try:
             with deep_recursion():
@@ -83,8 +87,12 @@ def compare(
             reason = str(error)
         else:
             if difference is None:
-                given = ("parameters have their defaults",) if has_own_parameters(*sides) else ()
-                return Comparison("equal", "each pass does the same with every well-formed world", given)
+                given = ["parameters have their defaults"] if has_own_parameters(*sides) else []
+                more = narrowed(second.ruleset, first.ruleset)
+                given += [f"`{name}` starts with what both can hold" for name in sorted({*fewer, *more})]
+                return Comparison(
+                    "equal", "each pass does the same with every well-formed world", tuple(given)
+                )
             model, number = difference.moment.model, (*difference.passes[0], -1)[0]
             reason = (
                 f"pass `{first.ruleset.passes[number].name}` may differ"
