@@ -175,6 +175,7 @@ class Symbols:
         shared: dict[str, Layout] | None = None,
     ) -> None:
         self.ruleset, self.budget = ruleset, budget
+        budget.spend(0)  # nothing is made if nothing is left
         self.net = Net()
         self.terms = Terms()
         self.layouts = shared or layouts(ruleset, program)

@@ -8,7 +8,8 @@ from powderdsl.compiler import load
 from powderdsl.model.text import one_line
 from powderdsl.model.types import Ruleset
 from powderdsl.prover.induction import Prover
-from powderdsl.prover.symbolic import Budget, Undecided, deep_recursion
+from powderdsl.prover.solver import OutOfWork
+from powderdsl.prover.symbolic import Budget, Evaluation, Undecided, deep_recursion
 from tests.semantics.texts import load_text
 
 SMALL = (
@@ -130,3 +131,12 @@ def test_what_changes_from_step_to_step_is_not_taken_for_the_same(claim: str, is
     except Undecided:
         moment = "undecided"
     assert (moment == "") == is_proven
+
+
+def test_no_formula_is_made_once_the_budget_is_spent(monkeypatch: pytest.MonkeyPatch) -> None:
+    ruleset = load_text(f"{PACK}  - mirrored worlds agree\n")
+    with deep_recursion():
+        prover = Prover(ruleset, Budget(-1))
+        monkeypatch.setattr(Evaluation, "value", pytest.fail)
+        with pytest.raises(OutOfWork):
+            prover.broken(ruleset.invariants[0].claim)
