@@ -9,7 +9,7 @@ from functools import cached_property, partial
 from powderdsl.compiler import lower
 from powderdsl.ir.bits import lower_pass
 from powderdsl.ir.lower import lower_condition
-from powderdsl.ir.ops import Node, Offset, PassGraph, Program, needed, nodes_of
+from powderdsl.ir.ops import REAL, Node, Offset, PassGraph, Program, needed, nodes_of
 from powderdsl.model.state import slots
 from powderdsl.model.types import Bounded, Claim, Local, Never, Ruleset, Symmetric, Total, Unchanging
 from powderdsl.prover.net import FALSE, Literal
@@ -403,6 +403,8 @@ class Prover:
             raise Undecided("directions that are reset do not turn")
         before = Before(symbols := self._symbols())
         pass_, net = self.planes[number], symbols.net
+        if any(node.type == REAL for _, node in pass_.outputs):
+            raise Undecided("floats in turned worlds")
         turned = Turned(before, symbols, turn)
         plain = Turned(Evaluation(before, symbols).after(pass_.outputs), symbols, turn)
         symbols.turn = turned.place

@@ -160,9 +160,7 @@ class Questions:
         if a == b:
             return TRUE
         key = (min(a, b), max(a, b))
-        if key not in self.same:
-            self.same[key] = self.symbols.about("same", *key)
-        return self.same[key]
+        return self.same.setdefault(key, self.symbols.about("same", *key))
 
     def _refine(self, concerned: Sequence[int]) -> bool:
         """Demand what the model breaks: equal terms are equal, and equal comparisons agree. False if it breaks nothing."""

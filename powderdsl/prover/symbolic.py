@@ -86,7 +86,7 @@ class Terms:
         """The gates that decide which of its parts a term is."""
         if term not in self._choices:
             kind, attr, *args = self.terms[term]
-            parts: list[Any] = args if kind == "select" or (kind in OPS and kind not in LEAVES) else []
+            parts: list[Any] = args if kind in OPS and kind not in LEAVES else []
             own = [attr >> 1] if kind == "select" else []  # type: ignore[operator]
             self._choices[term] = frozenset(own).union(*map(self.choices, parts))
         return self._choices[term]
@@ -254,9 +254,7 @@ class Symbols:
         if left is not None and right is not None:
             return int(bool(OPS[op].value(None, left, right)))
         key = (op, a, b)
-        if key not in self.comparisons:
-            self.comparisons[key] = self.about("comparison", *key)
-        return self.comparisons[key]
+        return self.comparisons.setdefault(key, self.about("comparison", *key))
 
     def about(self, *name: Any) -> Literal:
         """A variable about two floats, the end of its name: what they are depends on the gates that choose their parts."""

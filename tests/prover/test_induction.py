@@ -133,6 +133,24 @@ def test_what_changes_from_step_to_step_is_not_taken_for_the_same(claim: str, is
     assert (moment == "") == is_proven
 
 
+GUST = """
+pack: gusts
+elements: {air: {id: 0, color: "#000000"}}
+fields:
+  gust: {type: vec2(-2..2), at: element, default: "vector(1, -2)"}
+passes:
+  calm:
+    do: air -> air
+invariants:
+"""
+
+
+@pytest.mark.parametrize("turn", ["mirrored", "rotated"])
+def test_vectors_of_fresh_cells_are_not_taken_to_turn(turn: str) -> None:
+    with pytest.raises(Undecided):
+        verdicts(load_text(f"{GUST}  - {turn} worlds agree\n"))
+
+
 def test_no_formula_is_made_once_the_budget_is_spent(monkeypatch: pytest.MonkeyPatch) -> None:
     ruleset = load_text(f"{PACK}  - mirrored worlds agree\n")
     with deep_recursion():
