@@ -32,7 +32,7 @@ BACKENDS = {
     "auto": "`wasm` at once, and `native` once that is compiled; `cuda`, or else `torch`, on other devices",
     "torch": "torch tensors of 64 cells a word, on any device",
     "torch-cells": "torch tensors of one element a cell, on any device: the readable one",
-    "torch-fused": "the functions of `torch`, compiled by `torch.compile`, which takes minutes; then kept",
+    "torch-fused": "the functions of `torch`, compiled by torch's inductor, which takes minutes; then kept",
     "wasm": "generated WebAssembly, run by wasmtime on the CPU: starts at once, needs no compiler",
     "native": "generated C++ for the CPU; compiled once, then kept",
     "cuda": "generated CUDA C++ for a GPU: whole worlds on the chip, all steps of a call in one launch",

@@ -57,7 +57,7 @@ class _Kernels(NamedTuple):
 class PlanesProgram:
     """A program on bit planes, whose passes are generated torch functions.
 
-    `program` is the same on numbers. With `fuse`, `torch.compile` makes the functions.
+    `program` is the same on numbers. With `fuse`, inductor compiles the functions.
     """
 
     def __init__(self, program: Program, planes: Program, device: torch.device, *, fuse: bool = False):

@@ -3,7 +3,7 @@
 ``pass_0(k, words, fields, inputs)`` gets the bit planes of all slots as one tensor, int64 [planes, H, B, words of a row],
 the floats of all slots as a tuple, and the `inputs` of the pass: draws, parameters, bits of the step. It returns the new
 words and fields. `k` has the operations that depend on the layout of words and cells, see `library`. The same text runs
-eagerly and under ``torch.compile``.
+eagerly and compiled by inductor.
 """
 
 from __future__ import annotations
