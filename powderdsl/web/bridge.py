@@ -39,6 +39,10 @@ NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_-]{0,60}\.ya?ml")
 PACK = re.compile(r"[A-Za-z_][A-Za-z0-9_]{0,60}")
 
 
+PROOF = 10.0
+"""Seconds of work for proofs, counted: a third of the time that the page waits."""
+
+
 class BadRequest(ValueError):
     """The page, or a link to it, requests something that the session cannot do."""
 
@@ -161,18 +165,20 @@ class Session:
         return ledger_text(ledger(self._rules()))
 
     def invariants(self) -> list[dict[str, Any]]:
-        """The invariants: `proven` with the reason, `tried` on worlds, or `broken` with a small counterexample."""
+        """The invariants: `proven` with how and why, `tried` on worlds, or `broken` with a small counterexample."""
         from powderdsl.analysis.ledger import ledger
         from powderdsl.testing.properties.outcomes import counterexample_lines
         from powderdsl.testing.properties.search import quick_results
 
         rules = self._rules()
         rows = []
-        for result in quick_results(rules, ledger(rules)):
+        for result in quick_results(rules, ledger(rules), PROOF):
             status, note, prop = result.status, result.reason, result.prop
             if result.counterexample is not None:
                 note = "\n".join(counterexample_lines(result.counterexample, rules))
-            elif status != "proven":
+            elif status == "proven":
+                note = f"{result.proof}: {note}"
+            else:
                 status, note = "tried", ""
             rows.append({"text": prop.text, "status": status, "note": note, "owner": prop.owner})
         return rows

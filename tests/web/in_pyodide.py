@@ -26,6 +26,8 @@ COMMANDS = (
     "check broken.yaml --quick",
     "check life",
     "test life --examples 40",
+    "prove powderworld never (wood and momentum != 0)",
+    "prove life == life",
     "compile powderworld --emit model",
     "explain PD301",
     "trace powderworld --world garden --at 10,10 --step 5",

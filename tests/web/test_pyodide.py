@@ -59,7 +59,7 @@ def test_the_same_code_and_worlds(wheel: Path, tmp_path: Path, torch) -> None:  
     written = {path.name: path.read_bytes() for path in here.iterdir()}
     assert {path.name: path.read_bytes() for path in there.iterdir()} == written
     statuses = [text for name, text in sorted(written.items()) if name.startswith("status")]
-    assert [int(text) for text in statuses] == [0, 2, 0, 0, 0, 0, 0]
+    assert [int(text) for text in statuses] == [0, 2, 0, 0, 0, 0, 0, 0, 0]
 
     native = powderdsl.compile("powderworld", backend="native")
     world = native.step(native.replace(native.world(ids, seed=3), velocity=speed), 200)
