@@ -55,6 +55,7 @@ QUICK = [
     ("compile life --emit schedule --backend native", WORKS, WORKS),
     ("show life", WORKS, WORKS),
     ("test core --mutate --mutants 2 --jobs 1", "torch", "numpy"),
+    ("prove life == life", WORKS, WORKS),
     ("trace life --at 1,1 --step 1", WORKS, WORKS),
     ("record sand-pushing --episodes 1 --out ds", "torch", "numpy"),
     ("record --verify ds", "torch", "numpy"),

@@ -9,9 +9,8 @@ from itertools import product
 import numpy as np
 import pytest
 
-from powderdsl.ir import single
 from powderdsl.ir.bits import Bits, Gates
-from powderdsl.ir.ops import FLAG, OPS, Node, integer
+from powderdsl.ir.ops import FLAG, OPS, Node, integer, single, stepped
 from tests.schedule.interpreter import World, evaluate
 
 RANGES = [(0, 1), (0, 5), (-3, 3), (-8, 7), (-2, 9), (3, 12)]
@@ -136,7 +135,7 @@ def test_floats_are_those_of_numpy(numpy: Callable[..., np.ndarray], op: str) ->
 
 @pytest.mark.parametrize("value", [0.0, 2.0**-149, 1.0, 0.1, 3e38])
 def test_neighbors_of_floats(value: float) -> None:
-    value = single.single(value)
-    above = single.stepped(value, 1)
+    value = single(value)
+    above = stepped(value, 1)
     assert above == np.nextafter(np.float32(value), np.float32(math.inf))
-    assert single.stepped(above, -1) == value
+    assert stepped(above, -1) == value

@@ -53,7 +53,7 @@ def test_counted_by_hand() -> None:
 
 @pytest.mark.golden
 def test_golden_cost(golden) -> None:  # type: ignore[no-untyped-def]
-    result = powderdsl("check", "powderworld", "--cost", exits=0)
+    result = powderdsl("check", "powderworld", "--cost", "--quick", exits=0)
     golden(Path(__file__).parent / "golden" / "powderworld.cost.txt", result.stdout)
 
 

@@ -6,8 +6,9 @@ import pytest
 
 from powderdsl.diagnostics import Source
 from powderdsl.simulation.simulator import compile
-from powderdsl.testing.mutation.judging import GeneratedTest, Original, distinguish, with_tests, written_test
+from powderdsl.testing.mutation.judging import GeneratedTest, Original, with_tests, written_test
 from powderdsl.testing.pack_tests.runner import run_examples
+from powderdsl.testing.properties.comparison import distinguish
 from tests.semantics.texts import load_text
 
 NEW = GeneratedTest("p", "generated x", "- generated x:\n    given: a\n    expect: a\n")
