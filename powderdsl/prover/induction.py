@@ -250,7 +250,9 @@ class Prover:
 
     def _make_law(self, gone: frozenset[int]) -> Law:
         rows = [row for row in self.start.symbols.layouts.values() if row.slot.kind.name == "element"]
-        allowed = {row.slot.name: set(self.start.symbols.ids) - gone for row in rows}
+        known = set(self.start.symbols.ids) - gone
+        # The usual element of a field, gone or not, is in fresh cells, and in those that can hold no other.
+        allowed = {row.slot.name: known | {row.usual[i] or 0 for i in known} for row in rows}
 
         def law(moment: Moment, world: World, cell: Cell) -> Literal:
             net = moment.symbols.net

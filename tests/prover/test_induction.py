@@ -151,6 +151,26 @@ def test_vectors_of_fresh_cells_are_not_taken_to_turn(turn: str) -> None:
         verdicts(load_text(f"{GUST}  - {turn} worlds agree\n"))
 
 
+LOAD = """
+pack: loads
+elements:
+  sand: {id: 0, color: "#C0A060"}
+  acid: {id: 1, color: "#80F060"}
+  crate: {id: 2, color: "#604020"}
+fields:
+  load: {type: element, at: element, of: crate, default: acid}
+passes:
+  spill:
+    do: sand -> acid if load is acid
+invariants:
+"""
+
+
+def test_usual_elements_of_fields_are_there_though_worlds_start_without_them() -> None:
+    (broken,) = verdicts(load_text(f"{LOAD}  - count(acid) never rises without acid\n")).values()
+    assert broken == "spill.0"
+
+
 def test_no_formula_is_made_once_the_budget_is_spent(monkeypatch: pytest.MonkeyPatch) -> None:
     ruleset = load_text(f"{PACK}  - mirrored worlds agree\n")
     with deep_recursion():
