@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any
 
 from powderdsl.ir.ops import OPS, Threshold
@@ -24,6 +25,8 @@ class Model:
     params: Mapping[tuple[str, Threshold | None], int]
     numbers: Mapping[tuple[str, int], int]
     has_edges: bool
+    floats: tuple[float, ...]
+    """The constants among the floats, and what lies between them."""
 
 
 GATE = 10
@@ -150,8 +153,12 @@ class Questions:
                 *key, bit = name
                 key = key[:2] if kind == "coordinate" else key
                 numbers[kind][(*key,)] = numbers[kind].get((*key,), 0) | value << bit
-            has_edges |= kind == "inside"
-        return Model(cells, numbers["draw"], numbers["param"], numbers["coordinate"], has_edges)
+            has_edges |= kind == "outside"
+        terms = self.symbols.terms
+        known = {number for term in range(len(terms.terms)) if (number := terms.value(term)) is not None}
+        floats = [min(known) - 1, *sorted(known), max(known) + 1] if known else []
+        floats += [(low + high) / 2 for low, high in pairwise(floats)]
+        return Model(cells, numbers["draw"], numbers["param"], numbers["coordinate"], has_edges, (*floats,))
 
     # Floats
 

@@ -106,6 +106,8 @@ class Terms:
         if None not in values and OPS[op].evaluate is not None:
             return self.constant(OPS[op].value(attr, *values))
         if len(args) == 2:
+            if op == "add" and args[0] == args[1]:
+                return self.apply("mul", attr, (args[0], self.constant(2.0)))
             neutral = {"add": 0.0, "sub": 0.0, "mul": 1.0, "div": 1.0}.get(op)
             if neutral is not None and values[1] == neutral:
                 return args[0]
@@ -246,7 +248,8 @@ class Symbols:
         if self.turn:
             at, offset = self.turn(at), self.turn(offset)
         parts = zip(("row", "column"), at, offset, strict=True)
-        return self.net.all(self.net.variable("inside", axis, a, d) for axis, a, d in parts if d)
+        near = ((axis, a, e) for axis, a, d in parts for e in range(d, 0, -1 if d > 0 else 1))
+        return self.net.all(self.net.variable("outside", *name) ^ 1 for name in near)  # with all behind it
 
     def compare(self, op: str, a: Term, b: Term) -> Literal:
         """A comparison of floats: a variable, decided only for constants."""

@@ -52,11 +52,8 @@ def command(words: tuple[str, ...], prove: int, as_json: bool) -> int:
     return OK if status in ("equal", "proven") else FAILED
 
 
-Answer = tuple[str, list[str], dict[str, Any]]
-"""A status, lines of text, and the same as JSON."""
-
-
-def _compared(first: str, second: str, seconds: int) -> Answer:
+def _compared(first: str, second: str, seconds: int) -> tuple[str, list[str], dict[str, Any]]:
+    """A status, lines of text, and the same as JSON."""
     from powderdsl.testing.properties.comparison import compare_rules
     from powderdsl.testing.properties.outcomes import world_lines
 
@@ -69,19 +66,18 @@ def _compared(first: str, second: str, seconds: int) -> Answer:
     data: dict[str, Any] = {"reason": result.reason, "given": list(result.given)}
     if (shown := result.distinction) is not None:
         steps = counted(shown.steps, "step")
-        lines.append(f"  in {shown.slot}, after {steps} with seed {int(shown.sample.seed[0])}")
+        by = "these draws" if shown.draws else f"seed {int(shown.sample.seed[0])}"
+        lines.append(f"  in {shown.slot}, after {steps} with {by}")
         ids = {"before": shown.sample.ids, "first": shown.first["element"], "second": shown.second["element"]}
-        states = {title: values[0] for title, values in ids.items()}
-        lines += [f"  {line}" for line in world_lines(shown.sample, states, mine)]
-        data |= {title: values.tolist() for title, values in states.items()}
+        lines += [f"  {line}" for line in world_lines(shown.sample, {k: v[0] for k, v in ids.items()}, mine)]
+        data |= {title: values[0].tolist() for title, values in ids.items()}
         data |= {"steps": shown.steps, "slot": shown.slot, "seed": int(shown.sample.seed[0])}
         if shown.slot != "element":
-            fields = {
-                title: state[shown.slot][0].tolist()
-                for title, state in (("A", shown.first), ("B", shown.second))
-            }
-            lines += [f"  {shown.slot} in {title}: {values}" for title, values in fields.items()]
-            data["fields"] = fields
+            ends = ("A", shown.first), ("B", shown.second)
+            data["fields"] = {title: state[shown.slot][0].tolist() for title, state in ends}
+            lines += [f"  {shown.slot} in {title}: {values}" for title, values in data["fields"].items()]
+        data["draws"] = {name: values[0].tolist() for name, values in shown.draws.items()}
+        lines += [f"  draws of {name}: {values}" for name, values in data["draws"].items()]
     return result.status, lines, data
 
 
@@ -98,7 +94,7 @@ def _side(text: str) -> tuple[str, Ruleset]:
     return rules, replace(ruleset, passes=passes)
 
 
-def _claimed(rules: str, claim: str, seconds: int) -> Answer:
+def _claimed(rules: str, claim: str, seconds: int) -> tuple[str, list[str], dict[str, Any]]:
     from powderdsl.analysis.ledger import ledger
     from powderdsl.testing.properties.outcomes import counterexample_lines, result_data, result_line
     from powderdsl.testing.properties.search import quick_results

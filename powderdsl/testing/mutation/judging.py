@@ -341,7 +341,7 @@ def work(
     comparison = compare(original.sim, sim, PROOF, focused(original, mutant), seed)
     if comparison.status == "equal":
         return number, Verdict("equivalent", "a proof")
-    if comparison.distinction is None:
+    if comparison.distinction is None or comparison.distinction.draws:  # a test needs a seed
         return number, verdict
     test = written_test(mutant, comparison.distinction, original.sim, original.packs)
     return number, replace(verdict, differs_in=comparison.distinction.slot, test=test)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import chain, cycle, islice, permutations
 
@@ -18,19 +18,14 @@ from powderdsl.simulation.simulator import Simulator, compile
 from powderdsl.testing.generators.cases import Array, Start
 from powderdsl.testing.properties.models import starts
 from powderdsl.testing.properties.running import State, first_difference, random_samples, run_sample
-from powderdsl.testing.properties.search import Work, shrink_while
+from powderdsl.testing.properties.search import SEEDS, Work, shrink_while
 
 COMPARED = 6144
 """Random worlds on which two rulesets are compared."""
 
-RUN_STEPS = (2, 4, 8, 16, 48)
-"""How many steps batches run, one after the other."""
 
-TRIED_SEEDS = 16
-"""With how many seeds a smaller world is tried."""
-
-WORK = 1_000_000_000
-"""Work for making a world smaller, see `testing.properties.search`."""
+Draws = dict[str, Array]
+"""Draws [B, H, W] by stream; without any, seeds decide."""
 
 
 @dataclass(frozen=True)
@@ -45,6 +40,8 @@ class Distinction:
     slot: str
     first: State
     second: State
+    draws: Draws = field(default_factory=dict)
+    """Those of its only step, if no seed was found for them."""
 
 
 @dataclass(frozen=True)
@@ -93,37 +90,32 @@ def compare(
                 return Comparison(
                     "equal", "each pass does the same with every well-formed world", tuple(given)
                 )
-            model, number = difference.moment.model, (*difference.passes[0], -1)[0]
-            reason = (
-                f"pass `{first.ruleset.passes[number].name}` may differ"
-                if number >= 0
-                else "a pass may differ"
-            )
-    distinction = distinguish(first, second, focus, seed, model) if search else None
+            model, numbers = difference.moment.model, difference.passes[0]
+            name = f"pass `{first.ruleset.passes[numbers[0]].name}`" if numbers else "a pass"
+            reason = f"{name} may differ"
+    distinction = distinguish(first, second, focus, seed, model, names) if search else None
     status = "undecided" if distinction is None else "differ"
     return Comparison(status, reason, distinction=distinction)
-
-
-MAX_MATCHES = 24
-"""Ways in which draws without a name are matched."""
 
 
 def compare_rules(first: Ruleset, name: str, second: Ruleset, seconds: float) -> Comparison:
     """Compare a ruleset with another one of other files, which `name` loads: elements, fields and draws match by name.
 
-    Draws of `with chance` have no name. If they do not match in the order of the rules, other orders are tried.
+    Draws of `with chance` have no name, and streams may have other names: those of like rules match, others in any order.
     """
     second = _with_ids_of(first, name, second)
     params = _by_last_word([p.name for p in first.params], [p.name for p in second.params])
     sim, results = compile(first, "wasm", tensors=False), list[Comparison]()
-    for streams in islice(_matches(first, second), MAX_MATCHES):
-        idents = {stream.name: stream.ident for stream in first.streams}
-        renamed = [replace(s, ident=idents.get(streams.get(s.name, s.name), s.ident)) for s in second.streams]
+    for streams in islice(_matches(first, second), 24):
+        ids = {stream.name: stream.ident for stream in first.streams}
+        renamed = [replace(s, ident=ids.get(streams.get(s.name, s.name), s.ident)) for s in second.streams]
         other = compile(replace(second, streams=tuple(renamed)), "wasm", tensors=False)
         result = compare(sim, other, seconds, names=Names(params, streams), search=not results)
         results.append(result)
         if result.status == "equal":
-            given = tuple(f"draws of `{b}` are those of `{a}`" for b, a in streams.items() if a != b)
+            given = (
+                f"draws of `{b}` are those of `{a}`" for b, a in streams.items() if a in ids.keys() - {b}
+            )
             return replace(result, given=(*result.given, *given))
     return results[0]
 
@@ -141,71 +133,101 @@ def _with_ids_of(first: Ruleset, name: str, second: Ruleset) -> Ruleset:
 
 def _by_last_word(first: Sequence[str], second: Sequence[str]) -> dict[str, str]:
     """The first one's names by the other's, that are the same or end in the same word after a dot."""
-    known = {word.rpartition(".")[2]: word for word in first}
-    return {word: word if word in first else known.get(word.rpartition(".")[2], word) for word in second}
+    known, matched = {word.rpartition(".")[2]: word for word in first}, dict[str, str]()
+    for word in sorted(second, key=lambda word: word not in first):  # no two have one name
+        other = word if word in first else known.get(word.rpartition(".")[2], word)
+        matched[word] = word if other in matched.values() else other
+    return matched
 
 
 def _matches(first: Ruleset, second: Ruleset) -> Iterator[dict[str, str]]:
-    """Ways to match the draws of the second with those of the first: by name, then in any order where they have none."""
-    names, others = ([stream.name for stream in ruleset.streams] for ruleset in (first, second))
-    matched = _by_last_word(names, others)
-    yield matched
-    free = [name for name in names if "#" in name]
-    open_ = [name for name in others if "#" in name]
-    for order in permutations(free, len(open_)) if len(open_) <= len(free) else ():
-        match = matched | dict(zip(open_, order, strict=True))
-        if match != matched:
-            yield match
+    """Ways to match the draws of the second with those of the first: by name, by rules that are alike, or in any order."""
+    mine, theirs = (_uses(ruleset) for ruleset in (first, second))
+    matched = _by_last_word([*mine], [*theirs])
+    named = {name: word for name, word in matched.items() if "#" not in name and word in mine}
+    free = [name for name in mine if name not in named.values()]
+    best = dict[str, str]()
+    for name in sorted(theirs.keys() - named, key=lambda name: (theirs[name] not in mine.values(), name)):
+        left = [word for word in free if word not in best.values()] or [f"another {name}"]
+        best[name] = max(left, key=lambda word: (mine.get(word) == theirs[name], word == matched[name]))
+    open_ = [name for name, word in best.items() if mine.get(word) != theirs[name]]
+    rest = [word for word in free if word not in best.values()]
+    for words in permutations([*map(best.__getitem__, open_), *rest], len(open_)):
+        yield named | best | dict(zip(open_, words, strict=True))
+
+
+def _uses(ruleset: Ruleset) -> dict[str, tuple[int, str]]:
+    """The size of draws by stream, and the conditions of the rules that use them, without their name."""
+    uses = {stream.name: (stream.bits, "") for stream in ruleset.streams}
+    for rule in (rule for p in ruleset.passes for moment in p.moments for rule in moment.rules):
+        for name in {part.value for part in rule.mask.walk() if part.op == "draw"}:
+            uses[name] = uses[name][0], uses[name][1] + repr(rule.mask).replace(repr(name), "")
+    return uses
 
 
 def distinguish(
-    first: Simulator, second: Simulator, focus: Sequence[int] = (), seed: int = 0, model: Model | None = None
+    first: Simulator,
+    second: Simulator,
+    focus: Sequence[int] = (),
+    seed: int = 0,
+    model: Model | None = None,
+    names: Names | None = None,
 ) -> Distinction | None:
     """A small world on which two simulators differ, or None if none was found.
 
     Worlds of a model are tried first. Half of the others are made of elements `focus`, ids that are likely to matter.
-    Equal seeds give the same worlds.
+    Equal seeds give the same worlds. `names`: as for `compare`.
     """
     known = {slot.name for slot in second.slots}
-    names = tuple(slot.name for slot in first.slots if slot.name in known)
-    tries = TRIED_SEEDS if first.ruleset.streams or second.ruleset.streams else 1
+    slots = tuple(slot.name for slot in first.slots if slot.name in known)
+    sides = (first, Names()), (second, names or Names())
+    streams = [replace(s, name=words.stream(s.name)) for sim, words in sides for s in sim.ruleset.streams]
 
-    def states(sample: Start, steps: int) -> tuple[list[State], list[State]]:
-        return run_sample(first, sample, steps)[0], run_sample(second, sample, steps)[0]
+    def states(draws: Draws, sample: Start, steps: int) -> Iterator[list[State]]:
+        for sim, words in sides:
+            drawn = {s.name: draws[words.stream(s.name)] for s in sim.ruleset.streams if draws}
+            own = [p.name for p in sim.ruleset.params if sample.params]
+            params = {name: sample.params[words.params.get(name, name)] for name in own}
+            yield run_sample(sim, replace(sample, params=params), steps, drawn or None)[0]
 
-    def when(compared: Sequence[str], sample: Start, steps: int) -> Array:
-        return first_difference(*states(sample, steps), compared)
+    def when(draws: Draws, sample: Start, steps: int) -> Array:
+        mine, theirs = states(draws, sample, steps)
+        return first_difference(mine, theirs, compared)
 
-    shown = [] if model is None else [(sample, steps) for sample, _, steps in starts(model, first.ruleset)]
-    for compared in (names[:1], names):  # the worlds' elements show more than their fields
-        for sample, steps in chain(shown, _samples(first, second, focus, seed)):
-            steps_until = when(compared, sample, steps)
+    found = [] if model is None else starts(model, replace(first.ruleset, streams=tuple(streams)))
+    shown = [(some, sample, n) for sample, draws, steps in found for some, n in (({}, steps), (draws, 1))]
+    for compared in (slots[:1], slots):  # the worlds' elements show more than their fields
+        for draws, sample, steps in chain(shown, _samples(first, second, focus, seed)):
+            steps_until = when(draws, sample, steps)
             if not steps_until.any():
                 continue
             soonest = int(np.where(steps_until > 0, steps_until, steps + 1).argmin())
-            small, steps = shrink_while(
-                partial(when, compared),
-                sample.one(soonest),
-                int(steps_until[soonest]),
-                tries,
-                Work(first.ruleset, WORK),
-            )
-            if tries == 1:
+            small, steps = sample.one(soonest), int(steps_until[soonest])
+            draws = {name: values[soonest : soonest + 1] for name, values in draws.items()}
+            if draws:  # a seed that draws so, among worlds of a million cells
+                many = small.repeated(max((1 << 20) // small.ids.size, 1))
+                many = replace(many, seed=np.arange(len(many), dtype=np.int64))
+                lucky = when({}, many, 1)
+                small, draws = (many.one(int(lucky.argmax())), {}) if lucky.any() else (small, draws)
+            if not draws:
+                tries, work = SEEDS if streams else 1, Work(first.ruleset, 1_000_000_000)
+                small, steps = shrink_while(partial(when, {}), small, steps, tries, work)
+            if not streams:
                 small = replace(small, seed=np.zeros_like(small.seed))
-            mine, theirs = (ran[-1] for ran in states(small, steps))
+            mine, theirs = (ran[-1] for ran in states(draws, small, steps))
             slot = next(name for name in compared if (mine[name] != theirs[name]).any())
-            return Distinction(small, steps, slot, mine, theirs)
+            return Distinction(small, steps, slot, mine, theirs, draws)
     return None
 
 
 def _samples(
     first: Simulator, second: Simulator, focus: Sequence[int], seed: int
-) -> Iterator[tuple[Start, int]]:
+) -> Iterator[tuple[Draws, Start, int]]:
     """Worlds with the usual parameters, and how many steps they run. Every other batch is made of `focus` alone."""
     kinds, same = np.array(focus, np.uint8), set(first.slots) == set(second.slots)
-    batches = zip(random_samples(first.ruleset, seed, COMPARED), cycle(RUN_STEPS), strict=False)
+    batches = zip(random_samples(first.ruleset, seed, COMPARED), cycle((2, 4, 8, 16, 48)), strict=False)
     for number, (sample, steps) in enumerate(batches):
         sample = replace(sample, params={}, step=np.zeros_like(sample.step))
         if number % 2 and len(kinds) > 1:
             sample = replace(sample, ids=kinds[sample.ids % len(kinds)], fields={})
-        yield sample if same else replace(sample, fields={}), steps
+        yield {}, sample if same else replace(sample, fields={}), steps

@@ -49,9 +49,7 @@ def _batch(
         if world % 2:
             ids[world] = known[world // 2 % len(known)]
         place = [-corner[0], -corner[1]]
-        for axis, name in enumerate(
-            ("row", "column")
-        ):  # the cell that was asked about has the number of the model
+        for axis, name in enumerate(("row", "column")):  # the cell asked about has the number of the model
             numbers = [(number, modulus) for (word, modulus), number in model.numbers.items() if word == name]
             if numbers or model.has_edges:
                 allowed = [at for at in range(shape[axis]) if all(at % m == number for number, m in numbers)]
@@ -73,6 +71,11 @@ def _batch(
             number = None if slot.is_real else _number(slot, ruleset, bits)
             if number is not None:
                 put(values, cell, number)
+        if (
+            slot.is_real and model.floats
+        ):  # in every third world, what lies between constants, or is one of them
+            near = np.array([choices.pick(model.floats) for _ in range(values.size)]).reshape(values.shape)
+            values[::3] = np.clip(near, slot.kind.lo, slot.kind.hi)[::3]
         fields[slot.name] = clamped_to_holders(ruleset, slot, values, ids)
     draws = {}
     for stream in ruleset.streams:
@@ -83,9 +86,8 @@ def _batch(
                 put(draws[stream.name], (y, x), (number + 0.5) / 2.0**stream.bits)
     steps = [number for (axis, _), number in model.numbers.items() if axis == "step"]
     clock = np.full(COPIES, max(steps, default=0), np.int64)
-    return replace(
-        Start.fresh(ids, fields=fields, params=_params(model, ruleset)).seeded(), step=clock
-    ), draws
+    start = Start.fresh(ids, fields=fields, params=_params(model, ruleset)).seeded()
+    return replace(start, step=clock), draws
 
 
 def _number(slot: Slot, ruleset: Ruleset, bits: Mapping[str, bool]) -> int | None:
