@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import takewhile
 
 from powderdsl.compiler import lower
-from powderdsl.ir.bits import lower_pass
+from powderdsl.ir.bits import NotBits, lower_pass
 from powderdsl.ir.ops import REAL, PassGraph, Program
 from powderdsl.ir.text import structure
 from powderdsl.model.state import Slot, fresh_values, slots
@@ -118,7 +119,13 @@ def differs(first: Side, second: Side, budget: Budget) -> Difference | None:
     try:
         groups = _groups(first.program, second.program)
         differences = (_differ(first, second, numbers, budget, fixed) for numbers in groups)
-        return next((difference for difference in differences if difference), None)
+        found = next((difference for difference in differences if difference), None)
+        if found and all(found.passes) and found.passes[0][0]:  # show it by what the step begins with
+            until = tuple(range(found.passes[0][-1] + 1)), tuple(range(found.passes[1][-1] + 1))
+            with suppress(Undecided, OutOfWork, NotBits):
+                shown = _differ(first, second, until, Budget.of(5), fixed)
+                found = replace(shown, passes=found.passes) if shown else found
+        return found
     except OutOfWork:
         raise Undecided("the proof takes too long") from None
 

@@ -106,6 +106,8 @@ class Terms:
         if None not in values and OPS[op].evaluate is not None:
             return self.constant(OPS[op].value(attr, *values))
         if len(args) == 2:
+            if op == "sub" and values[1] is not None:
+                return self.apply("add", attr, (args[0], self.constant(-values[1])))
             if op == "add" and args[0] == args[1]:
                 return self.apply("mul", attr, (args[0], self.constant(2.0)))
             neutral = {"add": 0.0, "sub": 0.0, "mul": 1.0, "div": 1.0}.get(op)
