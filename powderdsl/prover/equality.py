@@ -13,10 +13,11 @@ from powderdsl.ir.ops import REAL, PassGraph, Program
 from powderdsl.ir.text import structure
 from powderdsl.model.state import Slot, fresh_values, slots
 from powderdsl.model.types import Ruleset
-from powderdsl.prover.induction import HERE, Moment, growing_ranges
+from powderdsl.prover.induction import HERE, MAX_WHOLE, Moment, growing_ranges
 from powderdsl.prover.net import Literal
 from powderdsl.prover.solver import OutOfWork
 from powderdsl.prover.symbolic import (
+    MAX_SIZE,
     Before,
     Budget,
     Evaluation,
@@ -123,7 +124,7 @@ def differs(first: Side, second: Side, budget: Budget) -> Difference | None:
         if found and all(found.passes) and found.passes[0][0]:  # show it by what the step begins with
             until = tuple(range(found.passes[0][-1] + 1)), tuple(range(found.passes[1][-1] + 1))
             with suppress(Undecided, OutOfWork, NotBits):
-                shown = _differ(first, second, until, Budget.of(5), fixed)
+                shown = _differ(first, second, until, Budget.of(1), fixed, MAX_WHOLE)
                 found = replace(shown, passes=found.passes) if shown else found
         return found
     except OutOfWork:
@@ -149,11 +150,13 @@ def _groups(first: Program, second: Program) -> Iterator[Numbers]:
     yield from (((len(a) - i,), (len(b) - i,)) for i in range(1, end + 1))
 
 
-def _differ(first: Side, second: Side, numbers: Numbers, budget: Budget, fixed: bool) -> Difference | None:
+def _differ(
+    first: Side, second: Side, numbers: Numbers, budget: Budget, fixed: bool, limit: int = MAX_SIZE
+) -> Difference | None:
     sides = (first, second)
     own = [layouts(side.ruleset, side.program) for side in sides]
     shared = {name: _narrower(row, own[1][name]) for name, row in own[0].items()}
-    symbols = Symbols(first.ruleset, first.program, budget, shared=shared)
+    symbols = Symbols(first.ruleset, first.program, budget, limit, shared)
     before = Before(symbols)
     afters: list[World] = []
     planes: dict[str, bool] = {}
