@@ -91,11 +91,8 @@ def compare(
                     "equal", "each pass does the same with every well-formed world", tuple(given)
                 )
             model, numbers = difference.moment.model, difference.passes[0]
-            reason = (
-                f"pass `{first.ruleset.passes[numbers[0]].name}` may differ"
-                if numbers
-                else "a pass may differ"
-            )
+            place = f"pass `{first.ruleset.passes[numbers[0]].name}`" if numbers else "a pass"
+            reason = f"{place} may differ"
     distinction = distinguish(first, second, focus, seed, model, names) if search else None
     status = "undecided" if distinction is None else "differ"
     return Comparison(status, reason, distinction=distinction)
