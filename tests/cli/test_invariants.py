@@ -60,8 +60,11 @@ def test_invariants_are_proven_or_broken_by_small_worlds(folder):
     assert all(one["status"] == "tested" for one in found["properties"] if one["pack"] == "automatic")
     (rock,) = [one for one in found["properties"] if one["property"] == "rock never changes"]
     world = rock["counterexample"]
-    assert world["before"] == [[1, 1], [0, 2], [0, 1]]
-    assert [world[name] for name in ("row", "column", "steps", "seed", "clock")] == [1, 1, 1, 0, 0]
+    before = world["before"]
+    assert len(before) * len(before[0]) <= 6
+    assert before[world["row"]][world["column"]] == 2
+    assert world["after"][world["row"]][world["column"]] == 0
+    assert (world["steps"], world["clock"]) == (1, 0)
     assert [rule["place"] for rule in world["rules"]] == ["yard.yaml:12"]
     assert rock["place"] == "yard.yaml:16"
     assert found["rules"] == {"all": 3, "never": []}
