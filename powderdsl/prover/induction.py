@@ -133,6 +133,8 @@ class Prover:
         self.ranges = growing_ranges(self.program)
         self._substeps: dict[tuple[int, bool], list[Moment]] = {}
         self._laws: dict[frozenset[int], Law] = {}
+        self._failures: list[int] = []
+        """Passes in which sums could not be proven."""
 
     def _symbols(self, limit: int = MAX_SIZE) -> Symbols:
         return Symbols(self.ruleset, self.program, self.budget, limit)
@@ -209,8 +211,13 @@ class Prover:
             case Unchanging():
                 return self.broken_by(partial(self._unchanging, claim.ids, given))
             case Total(ids=frozenset() as ids):
-                counted = (self._counted(number, ids, claim.trend, given) for number in passes)
-                return next((moment for moment in counted if moment), None)
+                for number in sorted(
+                    passes, key=self._failures.count, reverse=True
+                ):  # where others failed, first
+                    if moment := self._counted(number, ids, claim.trend, given):
+                        self._failures.append(number)
+                        return moment
+                return None
             case Symmetric():
                 turned = (self._symmetric(number, claim.turn) for number in passes)
                 return next((moment for moment in turned if moment), None)

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from powderdsl.ir.bits import NotBits
-from powderdsl.model.types import Claim, Ruleset
+from powderdsl.model.types import Claim, Ruleset, Total
 from powderdsl.prover.induction import Prover
 from powderdsl.prover.questions import Model
 from powderdsl.prover.solver import OutOfWork
@@ -27,7 +27,8 @@ def judgments(
 ) -> list[Judgment]:
     """Judge claims about worlds that start without some elements, one after the other.
 
-    `seconds` bounds the work for all of them: it is counted, so results are the same on every machine.
+    `seconds` bounds the work for all of them: it is counted, so results are the same on every machine. Sums, which take most
+    work, come last, and no claim gets more than an eighth.
     """
     try:
         with deep_recursion():
@@ -37,7 +38,14 @@ def judgments(
                 return [Judgment(False, f"pass `{spoiler.name}` may leave the range of a field")] * len(
                     claims
                 )
-            return [_judgment(prover, claim, without) for claim, without in claims]
+            order = sorted(range(len(claims)), key=lambda number: isinstance(claims[number][0], Total))
+            results = {}
+            for number in order:
+                rest = max(prover.budget.left - Budget.of(seconds / 8).left, 0)
+                prover.budget.left -= rest
+                results[number] = _judgment(prover, *claims[number])
+                prover.budget.left = max(prover.budget.left, 0) + rest
+            return [results[number] for number in range(len(claims))]
     except NotBits as error:
         return [Judgment(False, f"bit planes cannot carry the rules: {error}")] * len(claims)
     except (OutOfWork, Undecided):
