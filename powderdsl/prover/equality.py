@@ -1,4 +1,4 @@
-"""Whether two rulesets do the same with every world, at every step: pass by pass, from any well-formed world."""
+"""Proofs that two rulesets do the same with every world, pass by pass, from any well-formed world."""
 
 from __future__ import annotations
 
@@ -102,14 +102,14 @@ def narrowed(first: Ruleset, second: Ruleset) -> list[str]:
 
 
 def has_own_parameters(first: Side, second: Side) -> bool:
-    """True unless both have the same parameters, with the same defaults."""
+    """Return True unless both have the same parameters, with the same defaults."""
     known = second.names.params
     mine = {p.name: (p.kind, p.default) for p in first.ruleset.params}
     return mine != {known.get(p.name, p.name): (p.kind, p.default) for p in second.ruleset.params}
 
 
 def differs(first: Side, second: Side, budget: Budget) -> Difference | None:
-    """None if two rulesets with the same state are proven equal, else the first difference of passes.
+    """Return None if two rulesets with the same state are proven equal, else the first difference of passes.
 
     Where parameters have other values, each ruleset has its own. Raises Undecided and NotBits.
     """
@@ -120,13 +120,15 @@ def differs(first: Side, second: Side, budget: Budget) -> Difference | None:
     try:
         groups = _groups(first.program, second.program)
         differences = (_differ(first, second, numbers, budget, fixed) for numbers in groups)
-        found = next((difference for difference in differences if difference), None)
-        if found and all(found.passes) and found.passes[0][0]:  # show it by what the step begins with
-            until = tuple(range(found.passes[0][-1] + 1)), tuple(range(found.passes[1][-1] + 1))
+        difference = next((difference for difference in differences if difference), None)
+        if (
+            difference and all(difference.passes) and difference.passes[0][0]
+        ):  # show it by what the step begins with
+            until = tuple(range(difference.passes[0][-1] + 1)), tuple(range(difference.passes[1][-1] + 1))
             with suppress(Undecided, OutOfWork, NotBits):
                 shown = _differ(first, second, until, Budget.of(1), fixed, MAX_WHOLE)
-                found = replace(shown, passes=found.passes) if shown else found
-        return found
+                difference = replace(shown, passes=difference.passes) if shown else difference
+        return difference
     except OutOfWork:
         raise Undecided("the proof takes too long") from None
 

@@ -37,7 +37,7 @@ MAX_WHOLE = 40_000
 """Gates and terms of a pass that is looked at as a whole."""
 
 Law = Callable[["Moment", World, Cell], Literal]
-"""Whether a claim holds at a cell of a world of a moment."""
+"""A function that says whether a claim holds at a cell of a world of a moment."""
 
 
 @dataclass(eq=False)
@@ -55,7 +55,7 @@ class Moment:
     moves: tuple[tuple[Node, Offset], ...] = ()
     """Flags of cells that exchange something with a neighbor, and where that is."""
     only_moves: bool | None = None
-    """Whether it only exchanges elements between cells, once that is known."""
+    """True if the moment only exchanges elements between cells, None until that is known."""
     model: Model | None = None
     """The answer to the last question, if there was one."""
     _facts: dict[object, list[Literal]] = field(default_factory=dict)
@@ -71,12 +71,12 @@ class Moment:
         return evaluation.value(node, *cell)
 
     def keeps(self, law: Law, given: Sequence[Law] = ()) -> bool:
-        """Whether the law holds in a cell afterwards if it held in all cells before. Raises OutOfWork and Undecided."""
+        """Return whether the law holds in a cell afterwards if it held in all cells before. Raises OutOfWork and Undecided."""
         broken = law(self, self.after, HERE) ^ 1
         return broken in (FALSE, law(self, self.before, HERE) ^ 1) or not self.can_be([broken], [law, *given])
 
     def can_be(self, literals: Sequence[Literal], laws: Iterable[Law] = ()) -> bool:
-        """Whether literals can hold at once, in well-formed worlds where some laws hold in all cells.
+        """Return whether literals can hold at once, in well-formed worlds where some laws hold in all cells.
 
         Raises OutOfWork and Undecided.
         """
@@ -93,7 +93,7 @@ class Moment:
         return answer
 
     def _well_formed(self, cell: Cell, planes: Iterable[str]) -> list[Literal]:
-        """What is known of a cell of the starts, as far as it concerns some planes; from now on it is demanded."""
+        """Demand that a cell of the starts is well-formed, as far as it concerns some planes; return the facts."""
         key = (cell, *planes)
         if key not in self._facts:
             facts = [
@@ -203,7 +203,7 @@ class Prover:
         return moments
 
     def broken(self, claim: Claim, without: frozenset[int] = frozenset()) -> Moment | None:
-        """None if the claim is proven for worlds that start without some elements; else a moment that may break it, whose
+        """Return None if the claim is proven for worlds that start without some elements; else a moment that may break it, whose
         model shows how. Raises OutOfWork and Undecided."""
         given = [self.reachable(without)] if without else []
         passes = range(len(self.planes))
@@ -250,7 +250,7 @@ class Prover:
         )
 
     def reachable(self, gone: frozenset[int]) -> Law:
-        """Which elements cells and fields may hold if worlds start without some: a law that every moment keeps."""
+        """Return the law that names the elements of cells and fields if worlds start without some."""
         if gone not in self._laws:
             self._laws[gone] = self._make_law(gone)
         return self._laws[gone]
@@ -266,7 +266,7 @@ class Prover:
             return net.all(net.member(row.bits(world, *cell), allowed[row.slot.name]) for row in rows)
 
         def add(moment: Moment) -> bool:
-            """True if the moment adds nothing; otherwise what it adds is allowed from now on."""
+            """Return True if the moment adds nothing; otherwise what it adds is allowed from now on."""
             if moment.keeps(law):
                 return True
             for row in rows:
@@ -279,7 +279,7 @@ class Prover:
         return law
 
     def _never_for(self, claim: Never, given: Sequence[Law]) -> Moment | None:
-        """Whether a condition can hold in a cell for several steps in a row: whole steps, one after the other."""
+        """Return whether a condition can hold in a cell for several steps in a row: whole steps, one after the other."""
         if claim.steps > 2 and any(map(_reads_clock, self.planes)):
             raise Undecided("the clock")
         symbols, condition = self._symbols(), self._condition(claim)
@@ -331,13 +331,13 @@ class Prover:
         return None
 
     def _only_moves(self, moment: Moment) -> bool:
-        """Whether a substep only exchanges elements between cells: then it changes no number at all."""
+        """Return whether a substep only exchanges elements between cells: then it changes no number at all."""
         if moment.only_moves is not None:
             return moment.only_moves
         net, row = moment.symbols.net, moment.symbols.layouts["element"]
 
-        def differ(one: World, cell: Cell, other: World, place: Cell) -> Literal:
-            return net.any(map(net.xor, row.bits(one, *cell), row.bits(other, *place)))
+        def differ(world: World, cell: Cell, other: World, place: Cell) -> Literal:
+            return net.any(map(net.xor, row.bits(world, *cell), row.bits(other, *place)))
 
         def breaks(cells: Sequence[Cell]) -> Literal:
             pairs = zip(cells, reversed(cells), strict=True)
@@ -349,14 +349,14 @@ class Prover:
         return moment.only_moves
 
     def _matched(self, moment: Moment, ids: frozenset[int], trend: str, given: Sequence[Law]) -> bool:
-        """Whether a substep keeps the number of cells with some elements to a trend."""
+        """Return whether a substep keeps the number of cells with some elements to a trend."""
         net, row = moment.symbols.net, moment.symbols.layouts["element"]
 
         def counted(world: World, cell: Cell) -> Literal:
             return net.member(row.bits(world, *cell), ids)
 
         def breaks(cells: Sequence[Cell]) -> Literal:
-            """Whether the number of counted cells, of one or two, changes against the trend."""
+            """Return whether the number of counted cells, of one or two, changes against the trend."""
             sums = []
             for world in (moment.before, moment.after):
                 flags = [counted(world, cell) for cell in cells]
@@ -378,7 +378,7 @@ class Prover:
         breaks: Callable[[Sequence[Cell]], Literal],
         given: Sequence[Law],
     ) -> bool:
-        """Whether a sum over all cells may change in a forbidden way, for all that matching shows.
+        """Return whether a sum over all cells may change in a forbidden way, for all that matching shows.
 
         What moves matches cells in pairs, as far as they differ; other cells stay single. If no cell belongs to two pairs,
         and no pair and no single cell breaks the rule, neither does the sum.
@@ -397,7 +397,7 @@ class Prover:
         return moment.can_be([net.any(broken)], given)
 
     def _reach(self) -> int:
-        """How many rows or columns away from a cell the cells are on which it depends after a step."""
+        """Return the distance, in rows or columns, of the cells on which a cell depends after a step."""
         total = 0
         for pass_ in self.planes:
             evaluation = Evaluation(before := Before(symbols := self._symbols()), symbols)
@@ -407,7 +407,7 @@ class Prover:
         return total
 
     def _symmetric(self, number: int, turn: str) -> Moment | None:
-        """None if a pass gives the turned world for a turned world and turned draws."""
+        """Return None if a pass gives the turned world for a turned world and turned draws."""
         if any(slot.resets and slot.kind.name in ("direction", "vec2") for slot in slots(self.ruleset)):
             raise Undecided("directions that are reset do not turn")
         before = Before(symbols := self._symbols())

@@ -106,7 +106,7 @@ class Net:
     # Numbers: their bits, lowest first
 
     def below(self, bits: Sequence[Literal], limit: int) -> Literal:
-        """Whether an unsigned number is below a constant."""
+        """Return whether an unsigned number is below a constant."""
         if limit <= 0 or limit >= 1 << len(bits):
             return int(limit > 0)
         result = FALSE
@@ -115,7 +115,7 @@ class Net:
         return result
 
     def less(self, a: Sequence[Literal], b: Sequence[Literal]) -> Literal:
-        """Whether an unsigned number is less than another; a missing bit is 0."""
+        """Return whether an unsigned number is less than another; a missing bit is 0."""
         result = FALSE
         for i in range(max(len(a), len(b))):
             x, y = (bits[i] if i < len(bits) else FALSE for bits in (a, b))
@@ -123,19 +123,19 @@ class Net:
         return result
 
     def within(self, bits: Sequence[Literal], lo: int, hi: int, *, signed: bool) -> Literal:
-        """Whether a number lies in lo..hi."""
+        """Return whether a number lies in lo..hi."""
         if signed:  # half of the range more: no sign is left
             half = 1 << (len(bits) - 1)
             bits, lo, hi = [*bits[:-1], bits[-1] ^ 1], lo + half, hi + half
         return self.and_(self.below(bits, hi + 1), self.below(bits, lo) ^ 1)
 
     def member(self, bits: Sequence[Literal], values: Iterable[int]) -> Literal:
-        """Whether a number is one of some values, which may be negative."""
+        """Return whether a number is one of some values, which may be negative."""
         whole = (1 << len(bits)) - 1
         return self._member(tuple(bits), sum(1 << value for value in {value & whole for value in values}))
 
     def _member(self, bits: tuple[Literal, ...], values: int) -> Literal:
-        """Whether a number is one of those whose bits are set in `values`."""
+        """Return whether a number is one of those whose bits are set in `values`."""
         half = 1 << (len(bits) - 1) if bits else 0
         if not values or values == (1 << 2 * half) - 1 or not bits:
             return int(bool(values))

@@ -33,7 +33,7 @@ GATE = 10
 """Units of work for making a gate and its clauses."""
 
 MAX_ROUNDS = 400
-"""How often an answer is asked for again because equal floats compared differently in it."""
+"""The most times that a question is asked again because equal floats compared differently in its answer."""
 
 
 class Questions:
@@ -43,7 +43,7 @@ class Questions:
         self.symbols, self.net = symbols, symbols.net
         self.solver = Solver()
         self.same: dict[tuple[Term, Term], Literal] = {}
-        """Literals that two floats are equal."""
+        """A literal for each pair of floats: the two are equal."""
         self._facts = self._size = 0
         self._encoded: set[int] = set()
         self._model: dict[int, bool] = {}
@@ -90,7 +90,7 @@ class Questions:
             self.solver.add_clause([self._number(literal) for literal in literals if literal != FALSE])
 
     def ask(self, literals: Sequence[Literal], concerned: Sequence[int] | None = None) -> bool:
-        """Whether all of these can hold at once; then `holds` tells how. Raises OutOfWork.
+        """Return whether all of these can hold at once; then `holds` tells how. Raises OutOfWork.
 
         `concerned`: the gates that matter, if it is known; all others follow, or can be made to fit.
         """
@@ -163,7 +163,7 @@ class Questions:
     # Floats
 
     def equal_floats(self, a: Term, b: Term) -> Literal:
-        """Whether two floats are the same term once all choices are made."""
+        """Return whether two floats are the same term once all choices are made."""
         if a == b:
             return TRUE
         key = (min(a, b), max(a, b))

@@ -69,7 +69,7 @@ class Solver:
     def solve(
         self, assumptions: Sequence[int] = (), limit: int | None = None, decide: Iterable[int] | None = None
     ) -> bool:
-        """Whether all clauses and assumptions can be true.
+        """Return whether all clauses and assumptions can be true.
 
         With `decide`, only these variables are decided, and if they have values without a conflict, the answer is yes:
         right if the clauses of all others define them, as those of gates do.
@@ -95,7 +95,7 @@ class Solver:
             self._undo(0)
 
     def holds(self, literal: int) -> bool:
-        """Whether a literal is true in the last model that `solve` found, where variables without value are False."""
+        """Return whether a literal is true in the last model that `solve` found, where variables without value are False."""
         return (2 * abs(literal) + 1 in self._model) == (literal > 0)
 
     def _code(self, literal: int) -> int:

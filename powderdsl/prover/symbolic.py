@@ -1,7 +1,8 @@
 """Worlds as formulas: what a cell holds after some passes, as gates over what cells around it held before.
 
 Bits are literals of a net. Floats are terms that are not interpreted: equal operations on equal terms are equal, and
-little more. The grid is the infinite plane: a world that wraps is a plane that repeats, so what holds for all planes holds for all worlds.
+little more. The grid is the infinite plane: a world that wraps is a plane that repeats, so what holds for all planes holds
+for all worlds.
 """
 
 from __future__ import annotations
@@ -192,7 +193,7 @@ class Symbols:
         """The streams that were read, with the bits of their draws."""
         self.limit = limit
         self.turn: Callable[[Cell], Cell] | None = None
-        """Where the draws and edges of a turned world are in the other one, while a turned world is looked at."""
+        """The map from cells of a turned world to those of the other one, while a turned world is evaluated."""
         self._owners = {plane: row for row in self.layouts.values() for plane in row.planes}
         self._known: set[object] = set()
 
@@ -201,7 +202,7 @@ class Symbols:
         return self.net.size + len(self.terms.terms)
 
     def _once(self, *key: object) -> bool:
-        """True the first time."""
+        """Return True the first time that a key is given."""
         is_new = key not in self._known
         self._known.add(key)
         return is_new
@@ -246,7 +247,7 @@ class Symbols:
         return net.member(bits, [number for number in range(modulus) if (number + at) % modulus >> bit & 1])
 
     def inside(self, at: Cell, offset: Offset) -> Literal:
-        """Whether a neighbor lies inside the grid."""
+        """Return whether a neighbor lies inside the grid."""
         if self.turn:
             at, offset = self.turn(at), self.turn(offset)
         parts = zip(("row", "column"), at, offset, strict=True)
@@ -280,7 +281,7 @@ class Symbols:
     def well_formed(
         self, world: World, cell: Cell, planes: Iterable[str] | None = None, ranges: Ranges | None = None
     ) -> list[Literal]:
-        """What every cell fulfills, as far as it concerns these planes: known elements, numbers in their ranges, and
+        """Return what every cell fulfills, as far as it concerns these planes: known elements, numbers in their ranges, and
         usual values in cells of elements that hold no others. `ranges` are narrower ones."""
         net, element = self.net, self.layouts["element"]
         owners = (
@@ -316,7 +317,7 @@ class Before:
     def __init__(self, symbols: Symbols, tag: str = "") -> None:
         self.symbols, self.tag = symbols, tag
         self.reach = 0
-        """How many rows or columns away the farthest cell that was looked at is."""
+        """The distance of the farthest cell that was read, in rows or columns."""
 
     def bit(self, plane: str, y: int, x: int) -> Literal:
         self.reach = max(self.reach, abs(y), abs(x))
@@ -357,7 +358,7 @@ class Turned:
         }
 
     def place(self, at: Cell) -> Cell:
-        """Where a cell of the turned world is in the world."""
+        """Return the cell of the world that a cell of the turned world shows."""
         return (at[0], -at[1]) if self.turn == "mirrored" else (-at[1], at[0])
 
     def bit(self, plane: str, y: int, x: int) -> Literal:

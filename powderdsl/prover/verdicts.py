@@ -1,4 +1,4 @@
-"""What becomes of claims: proven, or perhaps broken in some moment of a step, or undecided."""
+"""Verdicts on claims: proven, possibly broken in a moment of a step, or undecided."""
 
 from __future__ import annotations
 

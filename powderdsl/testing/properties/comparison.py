@@ -194,8 +194,8 @@ def distinguish(
         mine, theirs = states(draws, sample, steps)
         return first_difference(mine, theirs, compared)
 
-    found = [] if model is None else starts(model, replace(first.ruleset, streams=tuple(streams)))
-    shown = [(some, sample, n) for sample, draws, steps in found for some, n in (({}, steps), (draws, 1))]
+    batches = [] if model is None else starts(model, replace(first.ruleset, streams=tuple(streams)))
+    shown = [(some, sample, n) for sample, draws, steps in batches for some, n in (({}, steps), (draws, 1))]
     for compared in (slots[:1], slots):  # the worlds' elements show more than their fields
         for draws, sample, steps in chain(shown, _samples(first, second, focus, seed)):
             steps_until = when(draws, sample, steps)

@@ -18,7 +18,7 @@ COPIES = 64
 """Worlds of a batch: each has other cells around, and another seed."""
 
 BATCHES = ((0, 1), (2, 1), (2, 3), (5, 2))
-"""How many rows and columns lie around the cells of the model, and how many steps the batch runs."""
+"""By batch: the rows and columns around the cells of the model, and the steps that it runs."""
 
 MAX_SIDE = 64
 
