@@ -166,13 +166,12 @@ class Session:
 
     def invariants(self) -> list[dict[str, Any]]:
         """The invariants: `proven` with how and why, `tried` on worlds, or `broken` with a small counterexample."""
-        from powderdsl.analysis.ledger import ledger
         from powderdsl.testing.properties.outcomes import counterexample_lines
         from powderdsl.testing.properties.search import quick_results
 
         rules = self._rules()
         rows = []
-        for result in quick_results(rules, ledger(rules), PROOF):
+        for result in quick_results(rules, PROOF):
             status, note, prop = result.status, result.reason, result.prop
             if result.counterexample is not None:
                 note = "\n".join(counterexample_lines(result.counterexample, rules))

@@ -26,7 +26,6 @@ import pytest
 from PIL import Image
 
 import powderdsl
-from powderdsl.analysis.ledger import ledger
 from powderdsl.compiler import load_with_diagnostics
 from powderdsl.datasets.manifest import read_manifest
 from powderdsl.diagnostics import CODES, CompileError, Diagnostic, Reporter, Severity, Source
@@ -122,7 +121,7 @@ def diagnostics_of(one: Example) -> tuple[Diagnostic, ...]:
         ruleset, remarks = load_with_diagnostics(*one.packs, path)
         return (
             *remarks,
-            *refuted(ruleset, quick_results(ruleset, ledger(ruleset))),
+            *refuted(ruleset, quick_results(ruleset)),
         )  # what `powderdsl check` says
     except CompileError as error:
         return error.diagnostics

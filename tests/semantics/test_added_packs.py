@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 
 import powderdsl as library
-from powderdsl.analysis.ledger import ledger
 from powderdsl.diagnostics import Severity
 from powderdsl.model.text import place_of
 from powderdsl.testing.generators.cases import Start
@@ -99,7 +98,7 @@ def write(name: str, text: str) -> str:
 def changes_of(rules: str) -> dict[str, str]:
     """What `powderdsl check` tells of added packs: invariants, and where the reason stands. Nothing may be worse."""
     ruleset = library.load(rules)
-    found = refuted(ruleset, quick_results(ruleset, ledger(ruleset)))
+    found = refuted(ruleset, quick_results(ruleset))
     assert {one.code for one in found} <= {"PD515"}
     assert all(one.severity is Severity.NOTE for one in found)
     return {one.message.split("`")[-2]: one.message.rpartition(": ")[2] for one in found}
@@ -130,7 +129,7 @@ def test_what_the_scope_breaks_alone_stays_an_error() -> None:
     acid.write_text(acid.read_text("utf-8").replace("(acid_proof, acid)", "(acid, empty)"), encoding="utf-8")
     moss = write("moss", ADDED[0].text)
     ruleset = library.load(f"rules/powderworld.yaml+{moss}")
-    found = {one.code: one for one in refuted(ruleset, quick_results(ruleset, ledger(ruleset)))}
+    found = {one.code: one for one in refuted(ruleset, quick_results(ruleset))}
     assert set(found) == {"PD512", "PD515"}
     assert found["PD512"].primary.span is not None
     assert found["PD512"].primary.span.text == "wall never changes"
@@ -139,11 +138,7 @@ def test_what_the_scope_breaks_alone_stays_an_error() -> None:
 def test_a_packs_own_claims_are_errors_only_where_it_breaks_them_itself() -> None:
     text = ADDED[1].text + "invariants:\n  - count(bane) is constant\n"
     ruleset = library.load(f"powderworld+{write('bane', text)}")
-    errors = [
-        one
-        for one in refuted(ruleset, quick_results(ruleset, ledger(ruleset)))
-        if one.severity is Severity.ERROR
-    ]
+    errors = [one for one in refuted(ruleset, quick_results(ruleset)) if one.severity is Severity.ERROR]
     assert [one.primary.span.text for one in errors if one.primary.span] == ["count(bane) is constant"]
     pole = "elements: {pole: {id: 125, density: 5, color: '#112233'}}\npasses:"
     text = ADDED[2].text.replace("passes:", pole) + "invariants: [pole never changes]\n"

@@ -8,19 +8,10 @@ from pathlib import Path
 import pytest
 
 import powderdsl
-from powderdsl.analysis.ledger import ledger
 from powderdsl.model.types import Ruleset
-from powderdsl.testing.properties import search
 from powderdsl.testing.properties.running import Runner
 from powderdsl.testing.properties.search import InvariantSearch, SearchPlan, quick_results, refuted
 from tests.semantics.texts import load_text
-
-
-@pytest.fixture(autouse=True)
-def many_worlds(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Try enough worlds that a rule with a small chance is seen to break its invariant."""
-    monkeypatch.setattr(search, "QUICK_WORLDS", 1024)
-
 
 WISHES = """pack: wishes
 elements:
@@ -69,7 +60,7 @@ NUT_LAST = (
 @pytest.mark.parametrize("rule", ["", "with chance 20%"])
 def test_values_have_names_and_what_decides_nothing_is_left_out(tmp_path: Path, rule: str) -> None:
     rules = load(tmp_path, rule)
-    (broken,) = refuted(rules, quick_results(rules, ledger(rules)))
+    (broken,) = refuted(rules, quick_results(rules))
     place, heading, *drawn = broken.notes
     # The world wraps around, so that either cell can be the nut; the shrinker keeps the one with the smaller seed.
     match = re.fullmatch(r"broken at row 0, (column \d), after 1 step with seed (\d+)", place)
@@ -82,11 +73,11 @@ def test_values_have_names_and_what_decides_nothing_is_left_out(tmp_path: Path, 
 
 def test_a_slow_machine_finds_the_same(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     rules = load(tmp_path, "with chance 20%")
-    first = refuted(rules, quick_results(rules, ledger(rules)))
+    first = refuted(rules, quick_results(rules))
     clock = iter(range(0, 10**9, 1000))
     monkeypatch.setattr("time.monotonic", lambda: float(next(clock)))
     monkeypatch.setattr("time.perf_counter", lambda: float(next(clock)))
-    assert refuted(rules, quick_results(rules, ledger(rules))) == first
+    assert refuted(rules, quick_results(rules)) == first
 
 
 DRIFT = """pack: drift

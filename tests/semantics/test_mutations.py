@@ -11,7 +11,6 @@ import pytest
 import yaml
 
 import powderdsl
-from powderdsl.analysis.ledger import ledger
 from powderdsl.compiler import load_with_diagnostics
 from powderdsl.diagnostics import CompileError, Severity
 from powderdsl.model.text import one_line
@@ -70,7 +69,7 @@ def test_the_checker_notices(row: dict[str, str], tmp_path: Path) -> None:
         return
     assert not codes
     invariants = tuple(one for one in ruleset.invariants if one_line(one.span) == statement)
-    (result,) = quick_results(replace(ruleset, invariants=invariants), ledger(ruleset))
+    (result,) = quick_results(replace(ruleset, invariants=invariants))
     assert not result.holds
     rows, columns = result.counterexample.sample.shape
     assert rows * columns <= MAX_CELLS

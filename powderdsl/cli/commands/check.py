@@ -153,7 +153,7 @@ def _judged(ruleset: Ruleset, prove: int) -> tuple[tuple[Diagnostic, ...], tuple
     from powderdsl.testing.properties.outcomes import result_data, result_line
     from powderdsl.testing.properties.search import quick_results, refuted  # brings numpy
 
-    results = quick_results(ruleset, _ledger(ruleset), prove)
+    results = quick_results(ruleset, prove)
     claims = tuple({**result_data(result), "line": result_line(result)} for result in results)
     return refuted(ruleset, results), claims
 

@@ -95,12 +95,11 @@ def _side(text: str) -> tuple[str, Ruleset]:
 
 
 def _claimed(rules: str, claim: str, seconds: int) -> tuple[str, list[str], dict[str, Any]]:
-    from powderdsl.analysis.ledger import ledger
     from powderdsl.testing.properties.outcomes import counterexample_lines, result_data, result_line
     from powderdsl.testing.properties.search import quick_results
 
     ruleset = load_with_claim(rules, claim)
-    (result,) = quick_results(ruleset, ledger(ruleset), seconds)
+    (result,) = quick_results(ruleset, seconds)
     lines = [result_line(result)]
     if result.counterexample is not None:
         lines += [f"      {line}" for line in counterexample_lines(result.counterexample, ruleset)]

@@ -28,11 +28,6 @@ from powderdsl.testing.properties.running import (
 
 
 @dataclass(frozen=True)
-class KnownIds:
-    """Cells and fields only ever name elements that the ruleset has."""
-
-
-@dataclass(frozen=True)
 class Agreement:
     """The backend gives what the reference gives."""
 
@@ -45,7 +40,7 @@ class Alike:
     copies: int
 
 
-Tested = Claim | KnownIds | Agreement | Alike
+Tested = Claim | Agreement | Alike
 
 SIGMAS = 6.0
 """How many standard deviations two frequencies may differ: by chance, more happens once in 500 million times."""
@@ -128,12 +123,6 @@ def find_breaks(claim: Tested, ruleset: Ruleset, sample: Start, states: list[Sta
                 fields = [table[cells] for cells in ids]
             outside = [np.asarray((values < claim.lo) | (values > claim.hi)) for values in fields]
             return _never([np.asarray(mask.any(1)) if mask.ndim == 4 else mask for mask in outside])
-        case KnownIds():
-            known = [element.id for element in ruleset.elements]
-            named = [slot.name for slot in slots(ruleset) if slot.kind.name == "element"]
-            return _breaks_of(
-                [reduce(or_, [~np.isin(state[name], known) for name in named]) for state in states[1:]]
-            )
     raise TypeError(f"{type(claim).__name__} needs more than one run")
 
 

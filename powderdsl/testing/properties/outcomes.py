@@ -12,7 +12,6 @@ from typing import Any
 
 import yaml
 
-from powderdsl.analysis.changes import RuleLine
 from powderdsl.arrays import np
 from powderdsl.diagnostics import CompileError, Reporter, Span
 from powderdsl.model.composition.added_packs import Difference
@@ -89,8 +88,6 @@ class Result:
     reason: str = ""
     proof: str = ""
     """How it was proven: ``ledger``, ``search`` or ``induction``; empty if it is not."""
-    doubts: tuple[RuleLine, ...] = ()
-    """The lines that stand in the way of a proof."""
     worlds: int = 0
     batches: int = 0
     sample: Start | None = None

@@ -6,12 +6,11 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import chain
+from math import inf
 from time import monotonic
 from typing import Any, ClassVar, Self
 
-from powderdsl.analysis.changes import RuleLine
-from powderdsl.analysis.ledger import Ledger, Proven
-from powderdsl.analysis.ledger import ledger as make_ledger
+from powderdsl.analysis.ledger import Proven, ledger
 from powderdsl.analysis.proofs import prove
 from powderdsl.arrays import np
 from powderdsl.diagnostics import Diagnostic, Label, Reporter
@@ -28,7 +27,6 @@ from powderdsl.testing.properties.breaks import (
     Agreement,
     Alike,
     Breaks,
-    KnownIds,
     Tested,
     breaks,
     find_breaks,
@@ -49,7 +47,6 @@ COPIES = 1024
 
 WORK = 500_000_000
 """Work for making worlds small, ten seconds or so: most need a hundredth of it."""
-
 
 PROOF = 60.0
 """Seconds of work for proofs: twice as much as the largest shipped ruleset needs."""
@@ -73,12 +70,9 @@ class InvariantSearch:
     runner: Runs
     plan: SearchPlan
     trials: list[Result] = field(default_factory=list)
-    ledger: Ledger | None = None
 
     few: ClassVar[Mapping[type, int]] = {Agreement: 2, Alike: 2, Never: 8}
     """Batches for claims that are expensive to check: by the oracle, in many copies, over many steps."""
-    work: ClassVar[int] = WORK
-    """Work for making a world small."""
 
     @classmethod
     def of(
@@ -86,27 +80,25 @@ class InvariantSearch:
         runner: Runs,
         plan: SearchPlan,
         declared_only: bool = False,
-        ledger: Ledger | None = None,
         texts: Collection[str] | None = None,
     ) -> Self:
         """Prove what can be proven; the rest is to be tried. `declared_only`: leave out what no pack claims.
 
-        `ledger`: that of the rules, if it is known already; `texts`: the only claims that matter.
+        `texts`: the only claims that matter.
         """
-        ledger = ledger or make_ledger(runner.ruleset)
-        search = cls(runner, plan, ledger=ledger)
+        entries, search = ledger(runner.ruleset), cls(runner, plan)
         for prop in properties_of(runner.ruleset):
             if texts is not None and prop.text not in texts:
                 continue
             if prop.owner == AUTOMATIC:
                 search.trials += [] if declared_only else [Result(prop)]
                 continue
-            verdict = prove(prop.claim, runner.ruleset, ledger, prop.without)  # type: ignore[arg-type]
+            verdict = prove(prop.claim, runner.ruleset, entries, prop.without)  # type: ignore[arg-type]
             if isinstance(verdict, Proven):
                 condition = f", given {verdict.given}" if verdict.given else ""
                 search.trials.append(Result(prop, verdict.reason + condition, verdict.by))
             else:
-                search.trials.append(Result(prop, doubts=verdict.rules))
+                search.trials.append(Result(prop))
         search.prove()
         return search
 
@@ -168,8 +160,8 @@ class InvariantSearch:
             for trial in shared:
                 self._note(trial, sample, find_breaks(trial.prop.claim, self.runner.ruleset, sample, states))
         for trial in trials:
-            if trial in shared:
-                continue
+            if trial in shared or (isinstance(trial.prop.claim, Alike) and isinstance(self.runner, Oracle)):
+                continue  # the oracle takes too long for thousands of worlds
             most = self.few.get(type(trial.prop.claim))
             large = isinstance(trial.prop.claim, Agreement) and sample.shape == LARGE
             if most is not None and trial.batches >= most and not large:
@@ -198,7 +190,7 @@ class InvariantSearch:
         broken = {trial.prop.text: trial for trial in self.trials if trial.sample is not None}
         for trial in broken.values():
             assert trial.sample is not None
-            work = Work(self.runner.ruleset, self.work // len(broken))
+            work = Work(self.runner.ruleset, WORK // len(broken))
             small = shrink(trial.prop.claim, self.runner, trial.sample, trial.steps, work, trial.prop.without)
             trial.counterexample = counterexample(trial.prop.claim, self.runner, *small)
         self.report_differences()
@@ -242,7 +234,6 @@ def properties_of(ruleset: Ruleset) -> list[Property]:
     """The declared invariants, then what every ruleset must fulfill."""
     properties = [
         *map(Property.of, ruleset.invariants),
-        Property(KnownIds(), "cells hold elements that the ruleset has", AUTOMATIC, None),
         Property(Agreement(), "the backend gives what the reference gives", AUTOMATIC, None),
     ]
     unique: dict[str, Property] = {}
@@ -252,22 +243,11 @@ def properties_of(ruleset: Ruleset) -> list[Property]:
     return [prop for prop in properties if unique[prop.text] is prop]
 
 
-# False invariants: `powderdsl check` reports each with the rule and a small world, before anything is trained. A few small
-# worlds run on the oracle, without torch: one that breaks an invariant refutes it. If none does, nothing is proven.
+# False invariants: `powderdsl check` reports each with the rule and a small world, before anything is trained. The worlds run
+# on the oracle, without torch.
 
-QUICK_WORLDS = 256
-"""Small worlds that are tried, and a few larger ones: enough for frequent mistakes."""
-
-QUICK_SEED = 6
-"""Of these worlds: with it, all mistakes in tests/mutations.yaml that break an invariant show."""
-
-QUICK_STEPS = 2
-
-FOCUSED = 2
-"""Batches that are tried once more with few elements."""
-
-FEW = 4
-"""A set of this many elements or more does not show what a line is about."""
+QUICK = 256
+"""Random worlds that are tried, and a few larger ones: enough for frequent mistakes."""
 
 
 def refuted(ruleset: Ruleset, results: Sequence[Result]) -> tuple[Diagnostic, ...]:
@@ -319,44 +299,14 @@ def _report_difference(
     )
 
 
-class QuickSearch(InvariantSearch):
-    """Tries a few worlds, and the first of them once more with few elements."""
-
-    # Where mirrored numbers are used in another way only frequencies can tell: thousands of worlds.
-    few: ClassVar[Mapping[type, int]] = {**InvariantSearch.few, Alike: 0}
-    work: ClassVar[int] = 200_000_000  # for all the worlds that were found: some seconds
-
-    def try_random(self) -> None:
-        for number, sample in enumerate(random_samples(self.runner.ruleset, QUICK_SEED, QUICK_WORLDS)):
-            if not self.undecided:
-                return
-            self.try_sample(sample, QUICK_STEPS)
-            for trial in self.undecided if number < FOCUSED else ():
-                kinds = _concerned(self, trial.doubts)
-                if kinds:
-                    ids = np.array(kinds, np.uint8)[sample.ids % len(kinds)]
-                    replace(self, trials=[trial]).try_sample(replace(sample, ids=ids, fields={}), QUICK_STEPS)
-
-
-def quick_results(ruleset: Ruleset, ledger: Ledger, proof: float = PROOF) -> list[Result]:
+def quick_results(ruleset: Ruleset, proof: float = PROOF) -> list[Result]:
     """Judge each invariant by a proof or a few worlds; a world that breaks an invariant is made small.
 
     The same rules give the same worlds. `proof`: as in SearchPlan.
     """
-    plan = SearchPlan(proof=proof)
-    search = QuickSearch.of(Oracle(ruleset), plan, declared_only=True, ledger=ledger)
+    search = InvariantSearch.of(Oracle(ruleset), SearchPlan(QUICK, inf, proof=proof), declared_only=True)
     search.try_random()
     return search.finish()
-
-
-def _concerned(search: InvariantSearch, lines: tuple[RuleLine, ...]) -> list[int]:
-    """Ids of the elements that some lines need, change or move."""
-    names: set[str] = set()
-    for entry in search.ledger.rules if search.ledger else ():
-        if entry.rule in lines:
-            names |= {name for some in entry.needs if len(some) < FEW for name in some}
-            names |= {name for pair in entry.changes[:FEW] for name in pair}
-    return sorted(element.id for element in search.runner.ruleset.elements if element.name in names)
 
 
 # Worlds made small: fewer steps, rows and columns, fewer things in them
