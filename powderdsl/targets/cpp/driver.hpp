@@ -18,12 +18,14 @@ struct Batch {
 };
 
 constexpr size_t LARGE_PLANE = 32 << 10;  // bytes from which a plane of LANES worlds is too large to be kept near
+constexpr int GROUP_WORK = 8;  // what a step of a group costs beside its words, in words
 // Strips waste no lanes where there are few worlds, and keep less at hand where worlds are large.
 static Grid make_grid(int worlds, int height, int width) {
   const int words = (width + BITS - 1) / BITS;
   const bool large = sizeof(V) * height * words >= LARGE_PLANE;
   const bool reachable = height / LANES >= std::max({1, AROUND_ROWS, BEYOND_ROWS});  // only the next strip is asked
-  const bool strips = height % LANES == 0 && reachable && (worlds <= LANES / 2 || large);
+  const int work = height * words + GROUP_WORK, strip_work = height / LANES * words + GROUP_WORK;
+  const bool strips = height % LANES == 0 && reachable && (large || (worlds <= LANES && worlds * strip_work < work));
   Grid g;
   g.height = strips ? height / LANES : height, g.strips = strips;
 #if !WIDTH
@@ -150,7 +152,7 @@ static void begin_step(Context& c, const Clocks& k, int number, long done) {
     const u32 first = mix(c.world_keys[0][l] + step), second = mix(c.world_keys[1][l] + step);
     for (int s = 0; s < STREAMS; s++) {
       const u32 a = mix(first + STREAM_IDENT[s]), b = mix(second + STREAM_IDENT[s]);
-      for (int i = HASHES * l; i < HASHES * (l + 1); i++) c.k0[s][i] = a + l * strip * APART, c.k1[s][i] = b;
+      for (int h = 0, i = l % PARTS, at = l / PARTS * HASHES; h < HASHES; h++, at++) c.k0[s][i][at] = a + l * strip * APART, c.k1[s][i][at] = b;
     }
   }
   std::fill_n(c.tossed, COINS, false);

@@ -54,56 +54,66 @@ static void close_plane(const Context& c, Plane* p) {  // nothing beyond the wid
 // Masks of choices, lane by lane: [LANES][height][words][c.masks], so that a lane finds the words of all masks side by side.
 #if VECTOR == 64
 ALWAYS V two_of(V a, V which, V b) {  // words of a, then of b, by their numbers
-#if WIDTH == 32
+#if WIDTH == 16
+  return (V)_mm512_permutex2var_epi16((__m512i)a, (__m512i)which, (__m512i)b);
+#elif WIDTH == 32
   return (V)_mm512_permutex2var_epi32((__m512i)a, (__m512i)which, (__m512i)b);
 #else
   return (V)_mm512_permutex2var_epi64((__m512i)a, (__m512i)which, (__m512i)b);
 #endif
 }
 #endif
-ALWAYS void turn(const V* in, V* out) {  // LANES vectors of LANES words
+ALWAYS void turn(const V* in, V* out) {  // TURN vectors; squares of as many words
 #if VECTOR == 64
   V number;
   for (int l = 0; l < LANES; l++) number[l] = l;
-  V rows[LANES];
-  _Pragma("GCC unroll 16") for (int i = 0; i < LANES; i++) rows[i] = in[i];
-  _Pragma("GCC unroll 4") for (int s = 0; 1 << s < LANES; s++) {  // pairs of rows, then of pairs, and so on
-    const V crossed = number ^ (Word)(1 << s), odd = (V)((number >> s & 1) != 0);
+  V rows[TURN];
+  _Pragma("GCC unroll 16") for (int i = 0; i < TURN; i++) rows[i] = in[i];
+  _Pragma("GCC unroll 4") for (int s = 0; 1 << s < TURN; s++) {  // pairs of rows, then of pairs, and so on
+    const V crossed = number ^ (Word)(1 << s), odd = (V)((right(number, s) & 1) != 0);
     const V low = mux(odd, crossed + LANES, number), high = mux(odd, number + LANES, crossed);
-    _Pragma("GCC unroll 16") for (int i = 0; i < LANES; i++)
+    _Pragma("GCC unroll 16") for (int i = 0; i < TURN; i++)
       if (!(i >> s & 1)) {
         const V a = rows[i], b = rows[i | 1 << s];
         rows[i] = two_of(a, low, b);
         rows[i | 1 << s] = two_of(a, high, b);
       }
   }
-  _Pragma("GCC unroll 16") for (int i = 0; i < LANES; i++) out[i] = rows[i];
+  _Pragma("GCC unroll 16") for (int i = 0; i < TURN; i++) out[i] = rows[i];
 #else
-  for (int i = 0; i < LANES; i++)
-    for (int l = 0; l < LANES; l++) out[l][i] = in[i][l];
+  for (int i = 0; i < TURN; i++)
+    for (int l = 0; l < LANES; l++) out[l % TURN][l - l % TURN + i] = in[i][l];
 #endif
 }
 OUTLINE void turn_masks(Context& c, const Plane* const* planes, int count, int place) {
   const int cells = c.g.cells();
   for (int i = 0; i < cells; i++)
-    for (int from = 0; from < count; from += LANES) {
-      V in[LANES], out[LANES];
-      for (int k = 0; k < LANES; k++) in[k] = from + k < count ? planes[from + k]->data[i] : splat(0);
+    for (int from = 0; from < count; from += TURN) {
+      V in[TURN], out[TURN];
+      for (int k = 0; k < TURN; k++) in[k] = from + k < count ? planes[from + k]->data[i] : splat(0);
       turn(in, out);
-      for (int l = 0; l < c.lanes; l++) *(V*)(c.turned + ((size_t)l * cells + i) * c.masks + place + from) = out[l];
+      for (int l = 0; l < c.lanes; l++)
+        *(Turned*)(c.turned + ((size_t)l * cells + i) * c.masks + place + from) = ((const Turned*)&out[l % TURN])[l / TURN];
     }
 }
 ALWAYS const Word* turned_row(const Context& c, int line) { return c.turned + (size_t)line * c.g.words * c.masks; }
+ALWAYS u32 turned_bits(Turned a) {  // a bit for each mask that has any
+#if VECTOR == 64 && WIDTH == 16
+  return _mm256_test_epi16_mask((__m256i)a, (__m256i)a);
+#else
+  return lanes_of((V)a);
+#endif
+}
 ALWAYS bool any_turned(const Context& c, const Word* masks, int count) {
-  V some = splat(0);
+  Turned some = {};
   for (int w = 0; w < c.g.words; w++)
-    for (int from = 0; from < count; from += LANES) some |= *(const V*)(masks + w * c.masks + from);
-  return any(some);
+    for (int from = 0; from < count; from += TURN) some |= *(const Turned*)(masks + w * c.masks + from);
+  return turned_bits(some);
 }
 // Which of up to 64 masks hold anything in a word.
 ALWAYS u64 which_turned(const Word* masks, int count) {
   u64 which = 0;
-  for (int from = 0; from < count; from += LANES) which |= (u64)lanes_of(*(const V*)(masks + from)) << (from & 63);
+  for (int from = 0; from < count; from += TURN) which |= (u64)turned_bits(*(const Turned*)(masks + from)) << (from & 63);
   return which;
 }
 // The chunks of word w, whose values wait in registers.

@@ -80,9 +80,7 @@ constexpr int TOGETHER = 4;
 ALWAYS bool near_rows(const Context& c, int dy) { return c.g.words == 1 && !c.g.strips && abs(dy) <= 1; }
 // `by` columns to the left on the torus.
 template <bool TURNS> ALWAYS V around(const Context& c, V x, int by) {
-  if (!TURNS) return x;
-  if (WIDTH) return rotated(x, by);
-  return ((x >> by) | (x << (c.g.width - by))) & c.valid(0);
+  return TURNS ? around(c, x, by) : x;
 }
 // The rows that movers leave or enter, in the direction in which they move, and if they are asked for the cells that they
 // enter there. The row whose movers go around is the last.
@@ -168,9 +166,9 @@ OUTLINE void swap_strips(Context& c, const V* m, V* const* data, int n, int here
   }
 }
 // A word's columns, moved by dx: those that stay in the word, and those that come into the next.
-ALWAYS V moved_within(const Context& c, V d, int w, int dx) { return (dx > 0 ? d << dx : d >> -dx) & c.valid(w); }
+ALWAYS V moved_within(const Context& c, V d, int w, int dx) { return (dx > 0 ? left(d, dx) : right(d, -dx)) & c.valid(w); }
 ALWAYS V moved_over(const Context& c, V d, int w, int next, int dx) {
-  return (dx > 0 ? d >> (columns_in(c, w) - dx) : d << (columns_in(c, next) + dx)) & c.valid(next);
+  return (dx > 0 ? right(d, columns_in(c, w) - dx) : left(d, columns_in(c, next) + dx)) & c.valid(next);
 }
 // A row of several words that exchanges with one some columns on. No two movers have a cell in common, so words may
 // take turns.
@@ -232,9 +230,9 @@ OUTLINE void swap_planes(Context& c, const Plane* movers, int dy, int dx, Plane*
       const int here = y * words + w, there = c.row(y + dy) + w;
       for (int k = 0; k < n; k++) {
         const V a = data[k][here], b = data[k][there];
-        const V d = (a ^ (by ? (b >> by) | (b << back) : b)) & m[w];
+        const V d = (a ^ (by ? around(c, b, by) : b)) & m[w];
         data[k][here] = a ^ d;
-        data[k][there] ^= by ? ((d << by) | (d >> back)) & c.valid(0) : d;  // read again: it may be the same row
+        data[k][there] ^= by ? around(c, d, back) : d;  // read again: it may be the same row
       }
     }
   }
@@ -245,10 +243,10 @@ template <Leaves LEAVES, bool AROUND>
 ALWAYS void arrive_row(const Context& c, V* const* data, int count, int here, int there, const V* m, const V* targets, int dx) {
   const int words = c.g.words, by = c.turn(-dx), back = c.g.width - by;
   if (__builtin_expect(words == 1, 1)) {
-    const V gone = m[0], keeps = ~targets[0], valid = c.valid(0);
+    const V gone = m[0], keeps = ~targets[0];
     for (int k = 0; k < count; k++) {
       const V a = data[k][here], moving = a & gone;
-      const V arriving = by ? ((moving >> by) | (moving << back)) & valid : moving;
+      const V arriving = by ? around(c, moving, by) : moving;
       if (LEAVES == NOTHING) data[k][here] = a & ~gone;
       if (LEAVES == EVERYTHING) data[k][here] = a | gone;
       if (AROUND) c.late[k] = arriving;

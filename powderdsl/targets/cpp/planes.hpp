@@ -4,32 +4,35 @@
 OUTLINE V columns_far(const Context& c, const V* row, int w, int dx) {  // farther than the last word of a row is wide
   const int n = c.g.words, rest = c.rest;
   auto word = [&](int i) -> V {  // words of the endless row: the last is continued by the first
-    if (i < 0) return (row[n - 1] << (BITS - rest)) | (row[n - 2] >> rest);
+    if (i < 0) return left(row[n - 1], BITS - rest) | right(row[n - 2], rest);
     if (i < n - 1) return row[i];
-    return i == n - 1 ? row[i] | (row[0] << rest) : (row[0] >> (BITS - rest)) | (row[1] << rest);
+    return i == n - 1 ? row[i] | left(row[0], rest) : right(row[0], BITS - rest) | left(row[1], rest);
   };
-  V r = dx > 0 ? (word(w) >> dx) | (word(w + 1) << (BITS - dx)) : (row[w] << -dx) | (word(w - 1) >> (BITS + dx));
+  V r = dx > 0 ? right(word(w), dx) | left(word(w + 1), BITS - dx) : left(row[w], -dx) | right(word(w - 1), BITS + dx);
   return r & c.valid(w);
 }
 ALWAYS int next_word(const Context& c, int w, int dx) {  // on the side that dx points to, around
   return dx > 0 ? (w + 1 == c.g.words ? 0 : w + 1) : (w == 0 ? c.g.words - 1 : w - 1);
 }
 ALWAYS int columns_in(const Context& c, int w) { return w == c.g.words - 1 ? c.rest : BITS; }
+ALWAYS V around(const Context& c, V x, int by) {  // a row of one word, `by` columns to the left on the torus
+  if (WIDTH) return rotated(x, by);
+  return (right(x, by) | left(x, c.g.width - by)) & c.valid(0);
+}
 ALWAYS V columns(const Context& c, const V* row, int w, int dx) {
   if (__builtin_expect(c.g.words != 1, 0)) {
     if (abs(dx) > c.rest) return columns_far(c, row, w, dx);
     const int next = next_word(c, w, dx);
-    if (dx > 0) return ((row[w] >> dx) | (row[next] << (columns_in(c, w) - dx))) & c.valid(w);
-    return ((row[w] << -dx) | (row[next] >> (columns_in(c, next) + dx))) & c.valid(w);
+    if (dx > 0) return (right(row[w], dx) | left(row[next], columns_in(c, w) - dx)) & c.valid(w);
+    return (left(row[w], -dx) | right(row[next], columns_in(c, next) + dx)) & c.valid(w);
   }
   const int by = c.turn(dx);
-  V x = row[0];
-  return by ? ((x >> by) | (x << (c.g.width - by))) & c.valid(0) : x;
+  return by ? around(c, row[0], by) : row[0];
 }
 ALWAYS V columns_zero(const Context& c, const V* row, int w, int dx) {
-  V x = dx > 0 ? row[w] >> dx : row[w] << -dx;
-  if (dx > 0 && w + 1 < c.g.words) x |= row[w + 1] << (BITS - dx);
-  if (dx < 0 && w > 0) x |= row[w - 1] >> (BITS + dx);
+  V x = dx > 0 ? right(row[w], dx) : left(row[w], -dx);
+  if (dx > 0 && w + 1 < c.g.words) x |= left(row[w + 1], BITS - dx);
+  if (dx < 0 && w > 0) x |= right(row[w - 1], BITS + dx);
   return x & c.valid(w);
 }
 ALWAYS const V* row_or_nothing(const Context& c, const Plane* p, int y) {
@@ -40,7 +43,11 @@ ALWAYS const V* row_or_nothing(const Context& c, const Plane* p, int y) {
 
 // Strips. What each lane sees `by` lanes on, around.
 ALWAYS V turned(V v, int by) {
-#if VECTOR == 64 && WIDTH == 32
+#if VECTOR == 64 && WIDTH == 16
+  V number;
+  for (int l = 0; l < LANES; l++) number[l] = l;
+  return (V)_mm512_permutexvar_epi16((__m512i)(number + splat(by)), (__m512i)v);  // by its low bits
+#elif VECTOR == 64 && WIDTH == 32
   const U number = NUMBERS;
   return (V)_mm512_permutexvar_epi32((__m512i)(number + splatu(by)), (__m512i)v);  // by its low bits
 #elif VECTOR == 64
@@ -87,29 +94,35 @@ static u32 world_key(u64 seed, u64 index, u32 start) {  // of all steps and stre
   return mix(mix(mix(start + (u32)seed) + (u32)(seed >> 32)) + (u32)index);
 }
 
-// Draws: bit j of 32 columns is one hash; a word has one or two. A plane's hashes start a constant after those of the plane before.
+// Draws: bit j of 32 columns is one hash; a word has one or two, or the low bits of one. A plane's hashes start a constant after those of the plane before.
 constexpr u32 APART = 0x9E3779B1u;
-constexpr int HASHES = BITS / 32;  // of a word
-ALWAYS U draw_start(const Context& c, int stream, int y, int w) {
+struct Start { U part[PARTS]; };
+ALWAYS Start draw_start(const Context& c, int stream, int y, int w) {
   const u32 across = (c.g.width + 31) / 32, n = ((u32)y * across + HASHES * w) * 32;
   const U number = NUMBERS;
-  return splatu(n * APART) + (number & (HASHES - 1)) * (32 * APART) + c.k0[stream];
+  Start start;
+  for (int i = 0; i < PARTS; i++) start.part[i] = splatu(n * APART) + (number & (HASHES - 1)) * (32 * APART) + c.k0[stream][i];
+  return start;
 }
-ALWAYS V draw_plane(const Context& c, int stream, U start, int j) {
-  U h = start + splatu((u32)j * APART);
-  h ^= h >> 16;
-  h *= 0x7FEB352Du;
-  h ^= h >> 15;
-  h = (h + c.k1[stream]) * 0x846CA68Bu;
-  h ^= h >> 16;
-  return (V)h;
+ALWAYS V draw_plane(const Context& c, int stream, const Start& start, int j) {
+  U bits = {};
+  for (int i = 0; i < PARTS; i++) {
+    U h = start.part[i] + splatu((u32)j * APART);
+    h ^= h >> 16;
+    h *= 0x7FEB352Du;
+    h ^= h >> 15;
+    h = (h + c.k1[stream][i]) * 0x846CA68Bu;
+    h ^= h >> 16;
+    bits |= PARTS == 1 ? h : (h & (u32)FULL) << BITS * i % 32;
+  }
+  return (V)bits;
 }
 // Several planes at once: the multiplications of one wait for each other, and after so many hardly a cell is open, so that the
 // processor foresees whether there are more.
 constexpr int AHEAD = VECTOR == 64 ? 8 : 4;
 #define EACH_AHEAD _Pragma("GCC unroll 8") for (int i = 0; i < AHEAD; i++)
 struct Drawn { V plane[AHEAD]; };
-ALWAYS Drawn draw_planes(const Context& c, int stream, U start, int first) {
+ALWAYS Drawn draw_planes(const Context& c, int stream, const Start& start, int first) {
   Drawn d;
   EACH_AHEAD d.plane[i] = draw_plane(c, stream, start, first + i);
   return d;
@@ -122,7 +135,7 @@ ALWAYS void compare_bit(V& below, V& open, V drawn, V limit) {
 ALWAYS V limit_bit(u64 limit, int bits, int j) { return splat((Word)0 - (Word)(limit >> (bits - 1 - j) & 1)); }
 // Which of the wanted cells draw below a constant; stops when all are decided.
 OUTLINE V draw_below(const Context& c, int stream, int y, int w, V wanted, int bits, u64 limit) {
-  const U start = draw_start(c, stream, y, w);
+  const Start start = draw_start(c, stream, y, w);
   V below = splat(0), open = wanted;
   int j = 0;
   const int last = bits - __builtin_ctzll(limit);
@@ -135,7 +148,7 @@ OUTLINE V draw_below(const Context& c, int stream, int y, int w, V wanted, int b
 }
 // The same with a limit given plane by plane, most significant (the carry) first.
 OUTLINE V draw_below_planes(const Context& c, int stream, int y, int w, V wanted, int bits, const V* limit) {
-  const U start = draw_start(c, stream, y, w);
+  const Start start = draw_start(c, stream, y, w);
   V below = wanted & limit[0], open = wanted & ~limit[0];
   int j = 0;
   for (; j + AHEAD <= bits && any(open); j += AHEAD) {
@@ -157,7 +170,7 @@ static V* coin_plane(Context& c, int coin, int stream) {
 // A draw of one world's cell as float32.
 OUTLINE float draw_cell(const Context& c, int stream, int lane, int y, int x, int bits) {
   double value = 0;
-  const U start = draw_start(c, stream, y, x / BITS);
+  const Start start = draw_start(c, stream, y, x / BITS);
   for (int j = 0; j < bits; j++) {
     V p = draw_plane(c, stream, start, j);
     value = 2 * value + (double)(p[lane] >> (x % BITS) & 1);

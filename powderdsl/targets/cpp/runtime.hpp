@@ -45,12 +45,12 @@ struct Context {
   V* entered;   // [height + 1]: the cells that movers enter, in the rows that a movement changes
   int* moving;  // [height + 1]: these rows
   Word* turned;                       // masks of choices, lane by lane, see turn_masks
-  static constexpr int masks = TURNED;  // of a word, a multiple of LANES
+  static constexpr int masks = TURNED;  // of a word, a multiple of TURN
   u32* marks;      // lanes that have anything in a row of some planes, see mark_rows
   float* waiting;  // rows of reals that loops some rows behind read
   float* zeros;
   u32 world_keys[2][LANES];
-  U k0[STREAMS + 1], k1[STREAMS + 1];
+  U k0[STREAMS + 1][PARTS], k1[STREAMS + 1][PARTS];
   V* coins[COINS + 1];      // planes
   bool tossed[COINS + 1];  // whether this step has filled them
   V step_bits[STEP_PLANES + 1];

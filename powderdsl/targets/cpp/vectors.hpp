@@ -1,7 +1,7 @@
 // The library that generated code builds on. One group = LANES worlds side by side: lane l of every vector is world l.
 // Or, in strips: one world, cut into LANES strips of as many rows, one below the other; lane l is strip l.
-// A plane is one bit a cell: 64 columns in a word, or 32 if worlds have 32 columns; a vector holds the same word of all
-// worlds of the group.
+// A plane is one bit a cell: 64 columns in a word, or as many as worlds have if those are 16 or 32; a vector holds the same
+// word of all worlds of the group.
 // Reals lie by world and row, with a halo of wrapped columns on both sides. Nothing here knows any rule.
 #include <algorithm>
 #include <atomic>
@@ -21,7 +21,7 @@
 typedef uint64_t u64;
 typedef uint32_t u32;
 // A vector is a register of the processor: compilers keep wider ones in memory, which takes six times as long.
-#if defined(__AVX512F__)
+#if defined(__AVX512BW__)
 #define VECTOR 64
 #define NUMBERS {0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15}
 #elif defined(__AVX2__)
@@ -33,15 +33,21 @@ typedef uint32_t u32;
 #endif
 // WIDTH is the number of columns if the library is for grids of that width alone, else 0. Most work is loops over the words
 // of a row and over columns: where their number is known, they cost a quarter less and compile faster.
-#if WIDTH == 32
+#if WIDTH == 16
+typedef uint16_t Word;
+#elif WIDTH == 32
 typedef u32 Word;
 #else
 typedef u64 Word;
 #endif
 constexpr int BITS = 8 * sizeof(Word), LANES = VECTOR / sizeof(Word), CHUNK = VECTOR / 4;
-constexpr Word FULL = ~(Word)0;
+constexpr int HASHES = BITS > 32 ? BITS / 32 : 1;  // of a word
+constexpr int PARTS = BITS < 32 ? 32 / BITS : 1;   // a hash in each 32 bits of so many vectors: lane l has number l / PARTS of part l % PARTS
+constexpr int TURN = LANES < 16 ? LANES : 16;      // words of a lane that masks of choices lie in, see turn_masks
+constexpr Word FULL = (Word)~0ull;
 constexpr u32 ALL = (1u << CHUNK) - 1;  // flags of a chunk
 typedef Word V __attribute__((vector_size(VECTOR), may_alias));
+typedef Word Turned __attribute__((vector_size(TURN * sizeof(Word)), may_alias));
 typedef u64 Wide __attribute__((vector_size(VECTOR), may_alias));
 typedef u32 U __attribute__((vector_size(VECTOR), may_alias));
 typedef float F __attribute__((vector_size(VECTOR), may_alias));
@@ -64,10 +70,15 @@ ALWAYS bool any(V a) {
 #endif
 }
 ALWAYS u32 lanes_of(V a) {  // a bit for each world that has any
-#if VECTOR == 64 && WIDTH == 32
+#if VECTOR == 64 && WIDTH == 16
+  return _mm512_test_epi16_mask((__m512i)a, (__m512i)a);
+#elif VECTOR == 64 && WIDTH == 32
   return _mm512_test_epi32_mask((__m512i)a, (__m512i)a);
 #elif VECTOR == 64
   return _mm512_test_epi64_mask((__m512i)a, (__m512i)a);
+#elif VECTOR == 32 && WIDTH == 16
+  const __m256i some = (__m256i)(a != 0);
+  return (u32)_mm_movemask_epi8(_mm_packs_epi16(_mm256_castsi256_si128(some), _mm256_extracti128_si256(some, 1)));
 #elif VECTOR == 32 && WIDTH == 32
   return (u32)_mm256_movemask_ps((__m256)(a != 0));
 #elif VECTOR == 32
@@ -83,13 +94,18 @@ ALWAYS bool any_word(const V* row, int words) {
   for (int w = 1; w < words; w++) some |= row[w];
   return any(some);
 }
+// Compilers refuse to shift words of 16 bits by an int.
+ALWAYS V right(V x, int by) { return x >> (Word)by; }
+ALWAYS V left(V x, int by) { return x << (Word)by; }
 ALWAYS V rotated(V x, int by) {  // each word to the right, by less than its width
-#if VECTOR == 64 && WIDTH == 32
+#if VECTOR == 64 && WIDTH == 16 && defined(__AVX512VBMI2__)
+  return (V)_mm512_shrdv_epi16((__m512i)x, (__m512i)x, (__m512i)splat(by));
+#elif VECTOR == 64 && WIDTH == 32
   return (V)_mm512_rorv_epi32((__m512i)x, (__m512i)splat(by));
-#elif VECTOR == 64
+#elif VECTOR == 64 && WIDTH != 16
   return (V)_mm512_rorv_epi64((__m512i)x, (__m512i)splat(by));
 #else
-  return (x >> by) | (x << (BITS - by));
+  return right(x, by) | left(x, BITS - by);
 #endif
 }
 ALWAYS V mux(V c, V a, V b) { return (c & a) | (~c & b); }
