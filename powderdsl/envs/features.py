@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from gymnasium import spaces
@@ -60,6 +60,12 @@ class MatrixPatches(nn.Module):
         return self.get_buffer("rows") @ observed @ self.get_buffer("columns")
 
 
+class Counts(NamedTuple):
+    """What `Patches.count` made of observations; the module takes them in their place."""
+
+    numbers: Tensor
+
+
 class Patches(MatrixPatches):
     """From bytes uint8 [B, C, H, W] to float32 [B, E + C − 1, rows, columns]: how much of each patch each element
     takes, and the means of all other channels.
@@ -79,18 +85,30 @@ class Patches(MatrixPatches):
         self.register_buffer("share", share[..., None].contiguous())
         self.register_buffer("values", values.float().cpu())
 
-    def forward(self, observed: Tensor) -> Tensor:
+    @property
+    def counts_all(self) -> bool:
+        """Whether counts are all that it makes patches of: the first channel is the only one."""
+        return len(self.get_buffer("values")) == 1
+
+    def count(self, observed: Tensor) -> Tensor:
+        """How many cells of each patch each element takes, float32 [B, rows, columns, E]."""
         batch, count = len(observed), self.patches[0] * self.patches[1] * self.elements
-        start = torch.arange(batch, dtype=torch.int32, device=observed.device) * count
-        number = self.get_buffer("first") + observed[:, 0].int() + start[:, None, None]
-        counts = torch.bincount(number.flatten(), minlength=batch * count)
-        shares = counts.view(batch, *self.patches, self.elements) * self.get_buffer("share")
-        parts = [shares.permute(0, 3, 1, 2)]
+        start = torch.arange(batch, device=observed.device) * count
+        number = observed[:, 0].long().add_(self.get_buffer("first")).add_(start[:, None, None]).flatten()
+        counts = torch.zeros(batch * count, device=observed.device)
+        counts.scatter_add_(0, number, counts.new_ones(1).expand(len(number)))
+        return counts.view(batch, *self.patches, self.elements)
+
+    def forward(self, observed: Tensor | Counts) -> Tensor:
+        """Bytes, or the same numbers as floats; or counts, if there is one channel. Channels are the last in memory."""
+        if isinstance(observed, Counts):
+            return (observed.numbers * self.get_buffer("share")).permute(0, 3, 1, 2)
+        parts = [(self.count(observed) * self.get_buffer("share")).permute(0, 3, 1, 2)]
         values = self.get_buffer("values")
         for channel in range(1, len(values)):
             cells = values[channel].index_select(0, observed[:, channel].int().flatten())
-            parts.append(super().forward(cells.view(batch, 1, *observed.shape[2:])))
-        return torch.cat(parts, 1) if len(parts) > 1 else parts[0].contiguous()
+            parts.append(super().forward(cells.view(len(observed), 1, *observed.shape[2:])))
+        return torch.cat(parts, 1) if len(parts) > 1 else parts[0]
 
 
 class Frames(nn.Module):
@@ -103,7 +121,7 @@ class Frames(nn.Module):
 
     def forward(self, observed: Tensor) -> Tensor:
         seen: Tensor = self.see(observed.reshape(-1, observed.shape[1] // self.frames, *observed.shape[2:]))
-        return seen.view(len(observed), self.channels, *seen.shape[2:])
+        return seen.reshape(len(observed), self.channels, *seen.shape[2:])
 
 
 class Features(BaseFeaturesExtractor):
@@ -124,7 +142,7 @@ class Features(BaseFeaturesExtractor):
     ):
         super().__init__(observation_space, features_dim)
         first, second = nn.Conv2d(channels, widths[0], *shapes[0]), nn.Conv2d(*widths, *shapes[1])
-        convolutions = nn.Sequential(see, first, nn.ReLU(), second, nn.ReLU(), nn.Flatten())
+        convolutions = nn.Sequential(see, first, nn.ReLU(True), second, nn.ReLU(True), nn.Flatten())
         with torch.no_grad():
             width = convolutions(torch.zeros(1, *observation_space.shape)).shape[1]
         self.layers = nn.Sequential(convolutions, nn.Linear(width, features_dim), nn.ReLU())

@@ -36,6 +36,9 @@ from powderdsl.tasks.task import Task
 DILATIONS = (1, 2, 4)
 """Of the residual blocks. With the first convolution, an output sees 17 bins in each direction, and the mean of all."""
 
+OPTIMIZER = {"eps": 1e-5, "fused": True}
+"""Of Adam; `eps` as Stable-Baselines3 has it."""
+
 
 def fcn_policy(env: TensorEnv, channels: int = 32, frames: int = 1) -> dict[str, Any]:
     """`policy_kwargs` of `BinPolicy` for the observations and actions of an environment.
@@ -48,6 +51,13 @@ def fcn_policy(env: TensorEnv, channels: int = 32, frames: int = 1) -> dict[str,
     return {"see": patches_of(env, bins, frames), "channels": channels, "bins": bins, "form": form}
 
 
+class PatchPolicy(ActorCriticCnnPolicy):
+    """The usual policy, whose features are made of the bytes of observations, without a copy as floats, or of `Counts`."""
+
+    def extract_features(self, obs: Any, features_extractor: Any = None) -> Any:
+        return self.features_extractor(obs)
+
+
 class Trunk(nn.Module):
     """From patches [B, C, rows, columns], with their places among the channels, to features [B, F, rows, columns]."""
 
@@ -58,9 +68,10 @@ class Trunk(nn.Module):
         self.means = nn.ModuleList(nn.Linear(width, width) for _ in DILATIONS)
 
     def forward(self, patches: Tensor) -> Tensor:
-        features = self.first(patches).relu()
+        features = self.first(patches).relu_()
         for block, mean in zip(self.blocks, self.means, strict=True):
-            features = features + (block(features) + mean(features.mean((2, 3)))[:, :, None, None]).relu()
+            added = block(features).add_(mean(features.mean((2, 3)))[:, :, None, None])
+            features = features + added.relu_()
         return features
 
 
@@ -120,9 +131,9 @@ class BinPolicy(ActorCriticPolicy):
         self.idle = nn.Linear(width, 1) if idle else None  # doing nothing has no place
         self.judge = nn.Sequential(
             nn.Conv2d(see.channels + 2, width, 3, 2, 1),
-            nn.ReLU(),
+            nn.ReLU(inplace=True),
             nn.Conv2d(width, width, 3, 2, 1),
-            nn.ReLU(),
+            nn.ReLU(inplace=True),
             nn.AdaptiveAvgPool2d(4),
             nn.Flatten(),
             nn.Linear(16 * width, 4 * width),
@@ -137,13 +148,14 @@ class BinPolicy(ActorCriticPolicy):
                 nn.init.orthogonal_(last.weight, 0.01)  # all actions about equally likely
         self.form = form
         make: Any = self.optimizer_class
-        self.optimizer = make(self.parameters(), lr=lr_schedule(1), eps=1e-5)
+        self.optimizer = make(self.parameters(), lr=lr_schedule(1), **OPTIMIZER)
 
     def _seen(self, observed: Tensor) -> Tensor:
         """Patches and their places, [B, C + 2, rows, columns]."""
         with torch.no_grad():
-            patches = self.see(observed)
-            return torch.cat([patches, self.get_buffer("places").expand(len(patches), -1, -1, -1)], 1)
+            patches = self.see(observed).permute(0, 2, 3, 1)
+            places = self.get_buffer("places").permute(1, 2, 0).expand(len(patches), -1, -1, -1)
+            return torch.cat([patches, places], 3).permute(0, 3, 1, 2)  # channels are the last in memory
 
     def _distribution(self, seen: Tensor) -> BinDistribution:
         features = self.trunk(seen)
@@ -179,7 +191,8 @@ def policy_of(config: TrainConfig, env: TensorEnv) -> tuple[type[ActorCriticPoli
     if config.network == "fcn":
         return BinPolicy, fcn_policy(env, config.features, config.frames)
     build = paper_policy if config.network == "paper" else small_policy
-    return ActorCriticCnnPolicy, build(env, features_dim=config.features, frames=config.frames)
+    how = build(env, features_dim=config.features, frames=config.frames)
+    return PatchPolicy, {**how, "optimizer_kwargs": OPTIMIZER}
 
 
 @dataclass(frozen=True)

@@ -19,16 +19,20 @@ from typing import Any
 
 import numpy as np
 import torch
+from gymnasium.spaces import Box
 from numpy.typing import NDArray
 from stable_baselines3 import PPO
+from stable_baselines3.common.buffers import RolloutBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import KVWriter, Logger
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.vec_env import VecEnv, VecFrameStack, VecNormalize
+from torch.distributions import Distribution
 
 from powderdsl.compiler import whole_palette
 from powderdsl.datasets.dataset import Dataset, Transitions, drawn
 from powderdsl.datasets.recorder import record
+from powderdsl.envs.features import Counts, Patches
 from powderdsl.envs.sb3 import PowderVecEnv
 from powderdsl.envs.tensor_env import channels_of, check_cells
 from powderdsl.experiments.runs import (
@@ -138,6 +142,31 @@ def train(config: TrainConfig, folder: str | Path, *, progress: Progress | None 
     return run
 
 
+class _Rollout(RolloutBuffer):
+    """A rollout. If `see` is given, it keeps what that counts in observations: once, for all epochs."""
+
+    def __init__(self, size: int, space: Any, *rest: Any, see: Patches | None, **how: Any):
+        self.see = see
+        if see is not None:
+            cells = round(1 / float(see.get_buffer("share").min()))  # of the largest patch
+            space = Box(0, cells, (*see.patches, see.elements), np.uint8 if cells < 256 else np.int32)
+        super().__init__(size, space, *rest, **how)
+
+    def add(self, obs: Any, *rest: Any) -> None:
+        """Add an action in every world, and what led to it and came of it."""
+        if self.see is not None:
+            obs = self.see.count(torch.as_tensor(obs, device=self.device)).cpu().numpy()
+        super().add(obs, *rest)
+
+    def to_torch(self, array: NDArray[Any], copy: bool = True) -> torch.Tensor:
+        """A tensor of a batch, which is a copy already."""
+        return torch.as_tensor(array, device=self.device)
+
+    def _get_samples(self, batch_inds: NDArray[Any], env: Any = None) -> Any:
+        batch: Any = super()._get_samples(batch_inds)
+        return batch if self.see is None else batch._replace(observations=Counts(batch.observations))
+
+
 class _Learner:
     """The PPO of a run, with its environment: perhaps with stacked observations and normalized rewards."""
 
@@ -153,6 +182,7 @@ class _Learner:
         if config.normalize in ("reward", "both"):
             env = self.normal = VecNormalize(env, norm_obs=False, gamma=config.gamma)
         kind, how = policy_of(config, self.worlds.tensors)
+        see = (how if "see" in how else how["features_extractor_kwargs"])["see"]
         with warnings.catch_warnings():
             # Where batches do not divide a rollout, the last one of an epoch is smaller: no mistake.
             warnings.filterwarnings("ignore", "You have specified a mini-batch size", UserWarning)
@@ -172,6 +202,8 @@ class _Learner:
                 target_kl=config.target_kl or None,
                 normalize_advantage=config.normalize in ("advantage", "both"),
                 policy_kwargs=how,
+                rollout_buffer_class=_Rollout,
+                rollout_buffer_kwargs={"see": see if isinstance(see, Patches) and see.counts_all else None},
                 device=config.device,
                 seed=config.seed,
             )
@@ -418,11 +450,13 @@ def _set_random_state(state: Mapping[str, Any]) -> None:
 
 @contextmanager
 def _own_random_numbers(threads: int) -> Iterator[None]:
-    """Restore the caller's generators and number of threads at the end."""
-    before, used = _random_state(), torch.get_num_threads()
+    """Restore the caller's generators and number of threads at the end. Till then, distributions check no numbers."""
+    before, used, checks = _random_state(), torch.get_num_threads(), Distribution._validate_args
     torch.set_num_threads(threads)
+    Distribution.set_default_validate_args(False)
     try:
         yield
     finally:
+        Distribution.set_default_validate_args(checks)
         torch.set_num_threads(used)
         _set_random_state(before)

@@ -10,14 +10,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from gymnasium.spaces import MultiDiscrete
 from PIL import Image
 
 from powderdsl.diagnostics import CompileError
 from powderdsl.envs.actions import random_policy
+from powderdsl.envs.features import Counts, Patches
 from powderdsl.envs.tensor_env import TensorEnv, observation_of
 from powderdsl.experiments.runs import RunFolder
 from powderdsl.rl import evaluate, load_policy, train
 from powderdsl.rl.evaluation import HAND, Film, film, play
+from powderdsl.rl.policies import policy_of
 from powderdsl.simulation.draw import OUTLINES
 from powderdsl.simulation.simulator import World
 from powderdsl.system.random import action_keys
@@ -44,6 +47,7 @@ def test_a_policy_that_only_acts_imports_no_compiler(run: RunFolder) -> None:
     """The first optimizer of a process imports `torch._dynamo`, which takes a second."""
     program = f"""
 import sys
+from powderdsl.envs.features import Counts, Patches
 from powderdsl.envs.tensor_env import TensorEnv
 from powderdsl.rl import load_policy
 from powderdsl.tasks.episodes import compile_task
@@ -54,6 +58,31 @@ print("torch._dynamo" in sys.modules)
         [sys.executable, "-c", program], capture_output=True, text=True, check=False, timeout=120
     )
     assert found.stdout == "False\n", found.stderr
+
+
+@pytest.mark.parametrize("network", ["small", "fcn"])
+def test_observations_are_counted_once_for_all_epochs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, network: str
+) -> None:
+    config, count, counted = quick(write_task(tmp_path), steps=32, network=network), Patches.count, []
+    env = TensorEnv(compile_task(config.task, backend="wasm"), 4)
+    kind, how = policy_of(config, env)
+    policy = kind(env.observation.space, MultiDiscrete(np.array(env.action_nvec)), lambda _: 1e-3, **how)
+    observed, actions = env.reset(seed=0)[0], torch.tensor([[1, 0, 1, 0, 0]] * 4)
+    counts = Counts(next(one for one in policy.modules() if isinstance(one, Patches)).count(observed).byte())
+    pairs = zip(
+        policy.evaluate_actions(counts, actions), policy.evaluate_actions(observed, actions), strict=True
+    )
+    assert all(torch.equal(one, other) for one, other in pairs)
+
+    def counting(see: Patches, observed: torch.Tensor) -> torch.Tensor:
+        counted.append(len(observed))
+        return count(see, observed)
+
+    monkeypatch.setattr(Patches, "count", counting)
+    train(config, tmp_path / "run")
+    # For the action and for the epochs; at ends of episodes, and once to build the network.
+    assert sum(counted) - counted.count(1) <= 2 * 32 + 4
 
 
 @pytest.mark.parametrize("deterministic", [True, False])
