@@ -16,7 +16,7 @@ from powderdsl.tasks.shipped import check_split, load_task
 from powderdsl.tasks.task import Task
 from powderdsl.tasks.tensors.actions import CLOCK, Hands, put_rows, put_worlds
 from powderdsl.tasks.tensors.generator import StartWorlds
-from powderdsl.tasks.tensors.measures import Facts, Meter, measures_in, scalar_value, scalars_of
+from powderdsl.tasks.tensors.measures import Facts, Masks, Meter, measures_in, scalar_value, scalars_of
 
 __all__ = ["Episodes", "TaskProgram", "check_actions", "compile_task", "load_task"]
 
@@ -40,7 +40,8 @@ class Episodes:
     `seed`, int64 [B], says which worlds they started as; `acted`, int64 [B], how many actions each has had;
     `failed`, bool [B], whether `failure` of `end:` holds now. `regions` are bool [B, H, W], or [1, H, W] if all
     worlds have the same; `targets` uint8 [B, H, W], 255 for no element; `start` and `before`, float64 [B, n], the
-    measures at the start and after the previous action (not updated if only the last action is rewarded).
+    measures at the start and after the previous action (not updated if only the last action is rewarded); `masks` are
+    regions and targets as counts of packed worlds read them.
     """
 
     world: World
@@ -49,6 +50,7 @@ class Episodes:
     failed: Tensor
     regions: Mapping[str, Tensor]
     targets: Mapping[str, Tensor]
+    masks: Masks
     start: Tensor
     before: Tensor
 
@@ -95,10 +97,10 @@ class TaskProgram:
         for name, (values, where) in starts.fields.items():
             state[name] = torch.where(where if values.ndim == 3 else where[:, None], values, state[name])
         world = World(self.simulator, state, *clock)
-        measured = self._meter.take(world, starts.regions, starts.targets, None)
-        return Episodes(
-            world, seeds, nothing.clone(), nothing.bool(), starts.regions, starts.targets, measured, measured
-        )
+        masks = self._meter.masks(starts.regions, starts.targets)
+        measured = self._meter.take(world, starts.regions, starts.targets, None, masks)
+        flags, maps = nothing.bool(), (starts.regions, starts.targets, masks)
+        return Episodes(world, seeds, nothing.clone(), flags, *maps, measured, measured)
 
     def restart(self, episodes: Episodes, mask: Tensor, seeds: Tensor, *, reuse: bool = False) -> Episodes:
         """The episodes where `mask`, bool [B], is set, rebuilt as worlds `seeds`, int64 [B]; the others unchanged.
@@ -122,6 +124,7 @@ class TaskProgram:
             put_worlds(episodes.world, places, new.world, reuse=reuse),
             regions={**episodes.regions, **placed(own, new.regions)},
             targets=placed(episodes.targets, new.targets),
+            masks=episodes.masks.put(places, new.masks, len(episodes), reuse),
             **placed({name: getattr(episodes, name) for name in ROWS}, vars(new)),
         )
 
@@ -148,10 +151,12 @@ class TaskProgram:
         if set(state) != names or tuple(state["element"].shape[1:]) != self.task.size:
             raise ValueError(f"these episodes are not of {self.task.name}: another state, or another size")
         seed, index, step = (_copy(part, device) for part in saved["clock"])
+        regions, targets = {**tensors(saved["regions"]), **self._fixed}, tensors(saved["targets"])
         return Episodes(
             world=World(self.simulator, state, seed, index, step),
-            regions={**tensors(saved["regions"]), **self._fixed},
-            targets=tensors(saved["targets"]),
+            regions=regions,
+            targets=targets,
+            masks=self._meter.masks(regions, targets),
             **tensors({name: saved[name] for name in ROWS}),
         )
 
@@ -195,7 +200,7 @@ class TaskProgram:
             world = self._free(world, last, params, seen)
         now = episodes.before
         if self._counts_always or bool(last.any()):
-            now = self._meter.take(world, episodes.regions, episodes.targets, params)
+            now = self._meter.take(world, episodes.regions, episodes.targets, params, episodes.masks)
         action = {"taken": acted, **done}
         if "left" in self._asked:
             action["left"] = agent.actions - acted
@@ -224,7 +229,7 @@ class TaskProgram:
 
     def measured(self, episodes: Episodes, params: Params = None) -> Tensor:
         """The current values of `measures`: float64 [B, n]."""
-        return self._meter.take(episodes.world, episodes.regions, episodes.targets, params)
+        return self._meter.take(episodes.world, episodes.regions, episodes.targets, params, episodes.masks)
 
     def _run(self, world: World, steps: int, params: Params, reuse: bool, seen: Seen) -> World:
         """The worlds after some steps, which run one at a time if they are to be seen."""

@@ -49,7 +49,8 @@ class ExpertPlayer:
                 self._plans |= zip(new, best_plans(self.program, worlds, self.expert.search), strict=True)
             steps = zip(seeds, episodes.acted.tolist(), strict=True)
             return torch.stack([self._plans[seed][min(step, last)] for seed, step in steps])
-        now = self._meter.take(episodes.world, episodes.regions, episodes.targets, None)
+        places = episodes.regions, episodes.targets
+        now = self._meter.take(episodes.world, *places, None, self._meter.masks(*places))
         left = self.program.task.agent.actions - episodes.acted
         facts = Facts(self._numbers, now, now, now, {"taken": episodes.acted, "left": left})
         actions = torch.zeros(len(episodes), 5, dtype=torch.int64, device=now.device)

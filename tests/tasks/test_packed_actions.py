@@ -77,6 +77,9 @@ regions:
   pit: box rows 9:17 columns 3:69
   blob: disk at (10, 40) radius 7
   drawn: box rows 4..6:9 columns :33
+targets:
+  aim:
+    - disk sand at (10, 10..60) radius 9
 generate:
   - repeat 9:
       - disk any at (0..19, 0..69) radius 2..6
@@ -94,8 +97,9 @@ reward: {each: EACH}
             "highest(sand) + highest(water or fire in pit) / share(empty) + count(wall in blob and not (west))",
             True,
         ),
-        ("count(not empty in drawn)", False),
-        ("count(sand in west) + count(water in drawn)", False),
+        ("count(not empty in drawn)", True),
+        ("share(sand in west) + share(water in drawn) + highest(not empty in drawn)", True),
+        ("sum(density in drawn) + mean(density - 2) + match(aim)", True),
         ("count(count(sand) > 2)", False),
         ("sum(velocity.column) + count(sand)", False),
         ("sum(row mod 32 if sand else 0) + count(sand)", False),

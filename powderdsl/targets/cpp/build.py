@@ -292,7 +292,7 @@ SIGNATURES = {
     "pd_free": "- p",
     "pd_copy": "p p",
     "pd_run": "p pilippplppp",
-    "pd_count": "- pipipiipp",
+    "pd_count": "- ppplplp",
     "pd_load": "- piiipl",
     "pd_store": "- piiiipl",
     "pd_put": "- piiipip",

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import struct
+import ctypes
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import torch
+import numpy as np
 from torch import Tensor
 
 from powderdsl.ir.ops import Node, ordered
@@ -21,15 +21,29 @@ MOST_GATES = 512
 
 @dataclass(frozen=True)
 class Counted:
-    """The number of cells where a flag and the mask `region`, if given, hold, divided by `divisor`.
+    """Cells where a flag and the mask `region`, if given, hold: each adds `weight` to the measure `number`.
 
-    With `highest`, the height of the highest such cell instead.
+    With `highest` the measure is the height of the highest such cell.
     """
 
     flag: Node
+    number: int
     region: str | None = None
     highest: bool = False
-    divisor: float = 1.0
+    weight: float = 1.0
+
+
+class CountsPlan(ctypes.Structure):
+    """`Counts` of views.hpp."""
+
+    _fields_ = (
+        *((name, ctypes.c_int) for name in ("gates", "counts", "numbers", "top", "bottom")),
+        ("gate", ctypes.c_void_p),
+        ("count", ctypes.c_void_p),
+    )
+
+
+_COUNT = np.dtype([("gate", "i4"), ("number", "i4"), ("highest", "i4"), ("weight", "f8")], align=True)
 
 
 class CellCounts:
@@ -37,8 +51,9 @@ class CellCounts:
 
     Args:
         counted: the counts; flags are nodes on bit planes of slots and masks.
+        numbers: how many measures there are.
         planes: the numbers of the program's planes by slot.
-        masks: words of masks that all worlds share, by name: int64 [H, ⌈W/64⌉].
+        masks: the numbers of masks by name.
         rows: the first row to count, and the row after the last.
 
     Raises:
@@ -48,12 +63,13 @@ class CellCounts:
     def __init__(
         self,
         counted: Sequence[Counted],
+        numbers: int,
         planes: Mapping[str, int],
-        masks: Mapping[str, Tensor],
+        masks: Mapping[str, int],
         rows: tuple[int, int],
     ):
-        names = list(masks)
-        self.masks = torch.stack(list(masks.values())) if masks else torch.zeros(0, dtype=torch.int64)
+        self.numbers = frozenset(count.number for count in counted)
+        """The measures that are counted."""
         gates: list[tuple[int, int, int]] = []
         places: dict[Node, int] = {}
 
@@ -66,7 +82,7 @@ class CellCounts:
             if node.op == "input" and node.attr in planes:
                 places[node] = gate(_PLANE, planes[node.attr])
             elif node.op == "input" and node.attr in masks:
-                places[node] = gate(_MASK, names.index(node.attr))
+                places[node] = gate(_MASK, masks[node.attr])
             elif node.op == "const":
                 nothing = gate(_NOTHING)
                 places[node] = gate(_OPS["not"], nothing) if node.attr else nothing
@@ -79,19 +95,24 @@ class CellCounts:
         for count in counted:
             end = places[count.flag]
             if count.region is not None:
-                end = gate(_OPS["and"], end, gate(_MASK, names.index(count.region)))
-            ends.append(struct.pack("iid", end, count.highest, count.divisor))
+                end = gate(_OPS["and"], end, gate(_MASK, masks[count.region]))
+            ends.append((end, count.number, count.highest, count.weight))
         if len(gates) > MOST_GATES:
             raise ValueError(f"{len(gates)} gates")
-        self._rows = rows
-        self._sizes = len(gates), len(ends)
-        # As the structs `Gate` and `Count` of views.hpp.
-        self._gates, self._counts = b"".join(struct.pack("iii", *gate) for gate in gates), b"".join(ends)
+        self._gates, self._ends = np.array(gates, np.int32), np.array(ends, _COUNT)
+        self.plan = CountsPlan(
+            len(gates), len(ends), numbers, *rows, self._gates.ctypes.data, self._ends.ctypes.data
+        )
 
-    def of(self, library: Any, handle: int, worlds: int) -> Tensor:
-        """The numbers in each world of a batch in native memory: float64 [B, n]."""
-        gates, counts = self._sizes
-        numbers = torch.empty(worlds, counts, dtype=torch.float64)
-        ends = (*self._rows, self.masks.data_ptr(), numbers.data_ptr())
-        library.pd_count(handle, gates, self._gates, counts, self._counts, *ends)
-        return numbers
+    def take(self, library: Any, handle: int, masks: Tensor, sizes: Tensor, values: Tensor) -> None:
+        """Write the measures of a batch in native memory into `values`, float64 [B, n].
+
+        `masks` are int64 [B or 1, m, H, ⌈W/64⌉]; `sizes`, which sums are divided by, float64 [B or 1, n].
+        """
+        apart = (masks.data_ptr(), row_stride(masks), sizes.data_ptr(), row_stride(sizes))
+        library.pd_count(handle, ctypes.byref(self.plan), *apart, values.data_ptr())
+
+
+def row_stride(rows: Tensor) -> int:
+    """Return the items from one world's row to the next, 0 if there is one row for all."""
+    return rows.stride(0) if len(rows) > 1 else 0

@@ -277,66 +277,82 @@ API void pd_planes(const void* batch, int count, const int* slots, u64* data, in
     }
 }
 
-// Numbers of cells where masks hold. A gate is a plane of the batch, one of the given masks, or an operation on earlier gates;
-// `masks` have [rows of a world][words] each. `found` is [world][count]: how many cells, or the height of the highest one
-// above the bottom, over `divisor`.
+// Numbers of cells where masks hold. A gate is a plane of the batch, a mask, or an operation on earlier gates. Masks are
+// [mask][rows of a world][words], `apart` words from one world's to the next's; 0 if all worlds share them.
 struct Gate {
   int op, a, b;  // 0 plane, 1 mask, 2 not, 3 and, 4 or, 5 xor, 6 nothing
 };
 struct Count {
-  int gate, highest;
-  double divisor;
+  int gate, number, highest;  // of the measure that its cells count for, or that their greatest height is
+  double weight;
 };
-static V mask_row(const Grid& g, const u64* mask, int y, int w) {
-  if (!g.strips) return splat(mask[(size_t)y * g.words + w]);
+struct Counts {
+  int gates, counts, numbers, top, bottom;  // rows to count
+  const Gate* gate;
+  const Count* count;
+};
+static V mask_row(const Batch& b, const u64* mask, int64_t apart, int n, int y, int w) {
+  const Grid& g = b.g;
+  if (!g.strips && !apart) return splat(mask[(size_t)y * g.words + w]);
   V row = splat(0);
-  for (int l = 0; l < LANES; l++) row[l] = mask[((size_t)l * g.height + y) * g.words + w];
+  for (int l = 0; l < LANES; l++) {
+    const int64_t world = g.strips ? n : std::min(n * LANES + l, b.worlds - 1);
+    row[l] = mask[world * apart + ((size_t)(g.strips ? l * g.height : 0) + y) * g.words + w];
+  }
   return row;
 }
-API void pd_count(const void* batch, int gates, const Gate* gate, int counts, const Count* count, int top, int bottom, const u64* masks, double* found) {
-  const Batch& b = *(const Batch*)batch;
+// `values` is [world][numbers]; `sizes`, which numbers are divided by, likewise, `sizes_apart` from world to world.
+static void count_cells(const Batch& b, const Counts& c, const u64* masks, int64_t apart, const double* sizes, int64_t sizes_apart, double* values) {
   const Grid& g = b.g;
   const size_t mask_words = (size_t)g.world_height() * g.words;
-  const int first = g.strips ? 0 : top, last = g.strips ? g.height : bottom, rest = g.width - BITS * (g.words - 1);
+  const int first = g.strips ? 0 : c.top, last = g.strips ? g.height : c.bottom, rest = g.width - BITS * (g.words - 1);
   const V whole = splat(FULL), edge = splat(FULL >> (BITS - rest));
-  V* value = aligned<V>(gates + 1);
-  std::vector<int64_t> total((size_t)counts * LANES);
-  std::fill(found, found + (size_t)b.worlds * counts, 0.0);
+  V* value = aligned<V>(c.gates + 1);
+  std::vector<int64_t> total((size_t)c.counts * LANES);
+  for (int i = 0; i < b.worlds; i++)
+    for (int k = 0; k < c.counts; k++) values[(size_t)i * c.numbers + c.count[k].number] = 0;
   for (int n = 0; n < (int)b.groups.size(); n++) {
     std::fill(total.begin(), total.end(), 0);
     for (int i = first * g.words; i < last * g.words; i++) {
       const int y = i / g.words, w = i % g.words;
-      for (int k = 0; k < gates; k++) {
-        const int a = gate[k].a, c = gate[k].b;
-        switch (gate[k].op) {
+      for (int k = 0; k < c.gates; k++) {
+        const int a = c.gate[k].a, d = c.gate[k].b;
+        switch (c.gate[k].op) {
           case 0: value[k] = b.groups[n].slot[a]->zero ? splat(0) : b.groups[n].slot[a]->data[i]; break;
-          case 1: value[k] = mask_row(g, masks + a * mask_words, y, w); break;
+          case 1: value[k] = mask_row(b, masks + a * mask_words, apart, n, y, w); break;
           case 2: value[k] = ~value[a]; break;
-          case 3: value[k] = value[a] & value[c]; break;
-          case 4: value[k] = value[a] | value[c]; break;
-          case 5: value[k] = value[a] ^ value[c]; break;
+          case 3: value[k] = value[a] & value[d]; break;
+          case 4: value[k] = value[a] | value[d]; break;
+          case 5: value[k] = value[a] ^ value[d]; break;
           default: value[k] = splat(0);
         }
       }
-      for (int k = 0; k < counts; k++) {
-        const V cells = value[count[k].gate] & (w == g.words - 1 ? edge : whole);
+      for (int k = 0; k < c.counts; k++) {
+        const V cells = value[c.count[k].gate] & (w == g.words - 1 ? edge : whole);
         for (int l = 0; l < LANES; l++) {
           int64_t& sum = total[(size_t)k * LANES + l];
-          if (!count[k].highest) sum += __builtin_popcountll(cells[l]);
+          if (!c.count[k].highest) sum += __builtin_popcountll(cells[l]);
           else if (cells[l]) sum = std::max<int64_t>(sum, g.world_height() - (g.strips ? l * g.height + y : y));
         }
       }
     }
-    for (int k = 0; k < counts; k++)
+    for (int k = 0; k < c.counts; k++)
       for (int l = 0; l < LANES; l++) {
         const int lane = n * LANES + l;
         if (lane >= b.lanes()) break;
-        double& sum = found[(size_t)(g.strips ? lane / LANES : lane) * counts + k];
-        const double part = (double)total[(size_t)k * LANES + l];
-        sum = count[k].highest ? std::max(sum, part) : sum + part;
+        double& sum = values[(size_t)(g.strips ? lane / LANES : lane) * c.numbers + c.count[k].number];
+        const double part = c.count[k].weight * (double)total[(size_t)k * LANES + l];
+        sum = c.count[k].highest ? std::max(sum, part) : sum + part;
       }
   }
-  for (int i = 0; i < b.worlds; i++)
-    for (int k = 0; k < counts; k++) found[(size_t)i * counts + k] /= count[k].divisor;
+  std::vector<char> divided(c.numbers);
+  for (int k = 0; k < c.counts; k++) {
+    const int number = c.count[k].number;
+    if (divided[number]++) continue;
+    for (int i = 0; i < b.worlds; i++) values[(size_t)i * c.numbers + number] /= sizes[i * sizes_apart + number];
+  }
   free(value);
+}
+API void pd_count(const void* batch, const Counts* counts, const u64* masks, int64_t apart, const double* sizes, int64_t sizes_apart, double* values) {
+  count_cells(*(const Batch*)batch, *counts, masks, apart, sizes, sizes_apart, values);
 }

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from powderdsl.ir.bits import NotBits, lower_bits
 from powderdsl.ir.lower import Inputs, ir_type, lower_expression, part_names
-from powderdsl.ir.ops import FLAG, Graph, PassGraph, Program, SlotType, Type, component_of
+from powderdsl.ir.ops import FLAG, Graph, Node, PassGraph, Program, SlotType, Type, component_of, plane_name
 from powderdsl.ir.stages import run_passes
 from powderdsl.model.state import slots
 from powderdsl.model.types import Expr, Ruleset
@@ -23,6 +23,7 @@ from powderdsl.targets.torch.program import DTYPES, Kernels, PassFunction, compi
 from powderdsl.targets.torch.source import pass_source
 from powderdsl.tasks.goals import REGION_LET, parts_of
 from powderdsl.tasks.task import NOTHING, Goal, Measure
+from powderdsl.tasks.tensors.actions import put_rows
 from powderdsl.worlds.raster import Size
 
 
@@ -35,6 +36,26 @@ def scalars_of(goal: Goal) -> list[Expr]:
 def measures_in(scalars: Iterable[Expr]) -> tuple[Measure, ...]:
     """Every measure among parts of expressions, once."""
     return tuple(dict.fromkeys(part.value for part in scalars if part.op == "measure"))
+
+
+@dataclass(frozen=True)
+class Masks:
+    """What counts of packed worlds need besides planes. With one row, all worlds share it.
+
+    `words`, int64 [B or 1, m, H, ⌈W/64⌉], are regions and targets; `sizes`, float64 [B or 1, n], are what the sums of
+    measures are divided by.
+    """
+
+    words: Tensor
+    sizes: Tensor
+
+    def put(self, places: Tensor, new: Masks, worlds: int, reuse: bool) -> Masks:
+        """Return the masks of `worlds` worlds with those of numbers `places` replaced."""
+        if len(self.sizes) < worlds:
+            return self
+        return Masks(
+            put_rows(self.words, places, new.words, reuse), put_rows(self.sizes, places, new.sizes, reuse)
+        )
 
 
 class Meter:
@@ -56,6 +77,11 @@ class Meter:
         self._counts: tuple[NativeProgram, CellCounts | None] | None = None
         values = [(number, measure) for number, measure in enumerate(measures) if measure.value is not None]
         self._cells = _Cells(ruleset, values, size, device) if values else None
+        self._bits = range(_types(ruleset)["element"].bits)
+        """Of element ids."""
+        named = {measure.region for measure in measures if measure.region is not None}
+        self._regions = sorted(named | {name.removeprefix(REGION_LET) for name in _lets(measures)})
+        self._targets = sorted({measure.target for measure in measures if measure.target is not None})
 
     def take(
         self,
@@ -63,59 +89,118 @@ class Meter:
         regions: Mapping[str, Tensor],
         targets: Mapping[str, Tensor],
         params: Mapping[str, Any] | None,
+        masks: Masks | None = None,
     ) -> Tensor:
-        """The numbers of all measures: float64 [B, n]. `params` are those that differ from the rules' own."""
-        state, batch = world.state, len(world)
-        if isinstance(state, PackedState):
-            if self._counts is None or self._counts[0] is not state.program:
-                self._counts = state.program, self._cell_counts(state.program)
-            counts = self._counts[1]
-            if counts is not None:
-                return counts.of(state.program.library, state.handle, batch)
-        cells = self._cells.of(world, regions, params) if self._cells is not None else {}
-        columns = []
-        for number, measure in enumerate(self.measures):
+        """The numbers of all measures: float64 [B, n]. `params` are those that differ from the rules' own.
+
+        With `masks`, packed worlds are not unpacked for measures that bit planes show.
+        """
+        values = torch.empty(len(world), len(self.measures), dtype=torch.float64, device=self.device)
+        counts = self.counts(world.state.program) if masks and isinstance(world.state, PackedState) else None
+        if counts is not None and masks is not None and isinstance(world.state, PackedState):
+            counts.take(world.state.program.library, world.state.handle, masks.words, masks.sizes, values)
+        self.take_cells(world, regions, targets, params, values, counts)
+        return values
+
+    def take_cells(
+        self,
+        world: World,
+        regions: Mapping[str, Tensor],
+        targets: Mapping[str, Tensor],
+        params: Mapping[str, Any] | None,
+        values: Tensor,
+        counts: CellCounts | None,
+    ) -> None:
+        """Write the numbers that `counts` does not take into `values`, float64 [B, n]."""
+        left = [number for number in range(len(self.measures)) if not counts or number not in counts.numbers]
+        cells = self._cells.of(world, regions, params) if self._cells is not None and left else {}
+        for number in left:
+            measure = self.measures[number]
             if measure.target is None:
-                columns.append(self._reduced(measure, cells[number], regions))
+                values[:, number] = self._reduced(measure, cells[number], regions)
                 continue
             target = targets[measure.target]
             size = (target != NOTHING).sum((1, 2)).double()
             same = (world.state["element"] == target).sum((1, 2)).double()
-            columns.append(same / size.clamp(min=1))
-        if not columns:
-            return torch.zeros(batch, 0, dtype=torch.float64, device=self.device)
-        return torch.stack([column.expand(batch) for column in columns], 1)
+            values[:, number] = same / size.clamp(min=1)
 
-    def _cell_counts(self, program: NativeProgram) -> CellCounts | None:
-        """Return a counter of all measures in packed worlds, if bit planes show all cells that are counted."""
-        counted_ways = ("count", "share", "highest")
-        values = [(i, measure) for i, measure in enumerate(self.measures) if measure.how in counted_ways]
-        regions = {measure.region for measure in self.measures if measure.region is not None}
-        if not values or len(values) < len(self.measures) or not regions <= self._fixed.keys():
-            return None
+    def masks(self, regions: Mapping[str, Tensor], targets: Mapping[str, Tensor]) -> Masks:
+        """Return the masks of worlds, in the order of `_mask_numbers`."""
+        planes = [regions[name] for name in self._regions]
+        for name in self._targets:
+            planes.append(targets[name] != NOTHING)
+            planes += [(targets[name] >> bit & 1) != 0 for bit in self._bits]
+        worlds = max(map(len, planes), default=1)
+        sizes = [self._sizes(measure, regions, targets).expand(worlds) for measure in self.measures]
+        words = [pack(plane.expand(worlds, *self.size)) for plane in planes]
+        return Masks(
+            torch.stack(words, 1) if words else torch.zeros(1, 0, dtype=torch.int64),
+            torch.stack(sizes, 1) if sizes else torch.zeros(1, 0, dtype=torch.float64),
+        )
+
+    def _sizes(self, measure: Measure, regions: Mapping[str, Tensor], targets: Mapping[str, Tensor]) -> Tensor:
+        """Return what the sum of a measure is divided by: float64 [B or 1]."""
+        if measure.target is not None:
+            size = (targets[measure.target] != NOTHING).sum((1, 2))
+        elif measure.how in ("share", "mean") and measure.region is not None:
+            size = regions[measure.region].sum((1, 2))
+        else:
+            whole = self.size[0] * self.size[1] if measure.how in ("share", "mean") else 1
+            size = torch.tensor([whole], device=self.device)
+        return size.clamp(min=1).double()
+
+    def counts(self, program: NativeProgram) -> CellCounts | None:
+        """Return a counter of the measures in packed worlds that bit planes show; None if they show none."""
+        if self._counts is None or self._counts[0] is not program:
+            shown = [number for number in range(len(self.measures)) if self._counter(program, [number])]
+            self._counts = program, self._counter(program, shown)
+        return self._counts[1]
+
+    def _counter(self, program: NativeProgram, numbers: Sequence[int]) -> CellCounts | None:
+        """Return a counter of some measures, or None if bit planes do not show them all."""
+        names = [*self._regions]
+        for name in self._targets:
+            names += [f"target {name}", *(plane_name(f"target {name}", bit) for bit in self._bits)]
+        masks = {name: number for number, name in enumerate(names)}
+        masks |= {REGION_LET + name: masks[name] for name in self._regions}
+        values = [(i, self.measures[i]) for i in numbers if self.measures[i].value is not None]
         try:
-            (pass_,) = lower_bits(_lowered(self.ruleset, values)).passes
-            flags, counted = dict(pass_.outputs), []
-            for i, measure in values:
-                flag, is_highest = flags[f"measure {i}"], measure.how == "highest"
-                counted.append(Counted(flag, measure.region, is_highest, self._cells_of(measure)))
-            masks = {name: pack(cells[0]) for name, cells in self._fixed.items()}
-            masks |= {REGION_LET + name: words for name, words in masks.items()}
-            everywhere = torch.ones(1, *self.size, dtype=torch.bool, device=self.device)
-            cells = torch.cat([self._fixed.get(str(measure.region), everywhere) for _, measure in values])
-            counted_rows = cells.any(2).any(0).nonzero()[:, 0].tolist() or [0]
-            rows = counted_rows[0], counted_rows[-1] + 1
-            return CellCounts(counted, program.layout.planes, masks, rows)
+            lowered = _lowered(self.ruleset, values)
+            types = {slot.name: slot.type for slot in lowered.slots}
+            flags = dict(lower_bits(lowered).passes[0].outputs) if values else {}
+            counted = []
+            for i in numbers:
+                measure, name = self.measures[i], f"measure {i}"
+                if measure.target is not None:
+                    counted.append(Counted(self._same(f"target {measure.target}"), i))
+                elif types[name] == FLAG:
+                    counted.append(Counted(flags[name], i, measure.region, measure.how == "highest"))
+                else:
+                    bits, signed = types[name].bits, types[name].signed
+                    for bit in range(bits):
+                        weight = float(-(1 << bit) if signed and bit == bits - 1 else 1 << bit)
+                        counted.append(Counted(flags[plane_name(name, bit)], i, measure.region, False, weight))
+            return CellCounts(counted, len(self.measures), program.layout.planes, masks, self._rows(numbers))
         except (NotBits, KeyError, ValueError):
-            return None  # floats, neighbors, other regions: tensors show them
+            return None  # floats, neighbors, too many gates: tensors show them
 
-    def _cells_of(self, measure: Measure) -> float:
-        """Return the divisor of a number of cells."""
-        if measure.how != "share":
-            return 1.0
-        region = measure.region
-        cells = self.size[0] * self.size[1] if region is None else int(self._fixed[region].sum())
-        return float(max(1, cells))
+    def _same(self, target: str) -> Node:
+        """Return the cells that hold the element of a target, as a node on planes and masks."""
+        build = Graph()
+        same = build.input(target, FLAG)
+        for bit in self._bits:
+            here = build.input(plane_name("element", bit), FLAG)
+            differs = build.node("xor", FLAG, (here, build.input(plane_name(target, bit), FLAG)))
+            same = build.node("and", FLAG, (same, build.node("not", FLAG, (differs,))))
+        return same
+
+    def _rows(self, numbers: Sequence[int]) -> tuple[int, int]:
+        """Return the first row that some measures count, and the row after the last."""
+        regions = [str(self.measures[number].region) for number in numbers]
+        if not regions or not {*regions} <= self._fixed.keys():
+            return 0, self.size[0]
+        rows = torch.cat([self._fixed[name] for name in regions]).any(2).any(0).nonzero()[:, 0].tolist() or [0]
+        return rows[0], rows[-1] + 1
 
     def cells(self, number: int, world: World, regions: Mapping[str, Tensor]) -> Tensor:
         """The cells that a measure counts, bool [B, H, W]."""
