@@ -9,6 +9,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import cached_property
+from math import prod
 from typing import Any, NamedTuple
 
 import torch
@@ -19,7 +20,7 @@ from powderdsl.ir.ops import component_of
 from powderdsl.model.state import Slot, property_dtype, property_values, slots
 from powderdsl.model.types import Ruleset
 from powderdsl.simulation.draw import looks, rgb
-from powderdsl.targets.cpp.program import PackedState
+from powderdsl.targets.cpp.program import NativeProgram, PackedState, Views
 from powderdsl.targets.job import shape_of
 from powderdsl.targets.tensor_kind import Tensors, pack, word_count
 
@@ -50,6 +51,8 @@ class Observer:
         self.ruleset = ruleset
         self.device = torch.empty(0, device=device).device  # with its number
         self.slots: dict[str, Slot] = {slot.name: slot for slot in slots(ruleset)}
+        self._views: dict[tuple[str, int], tuple[NativeProgram, Views]] = {}
+        """By kind and number of cells; of the program that ran last."""
 
     @torch.no_grad()
     def read(self, state: State, name: str, out: Any = None) -> Tensor:
@@ -64,18 +67,7 @@ class Observer:
         out, shown = self.buffer(out, (*shape_of(state), 3), torch.uint8), self._looks
         if not isinstance(state, PackedState):
             return out.copy_(rgb(state["element"], fields=state, kind=Tensors(self.device), **shown))
-        program = state.program
-        slot, bits, _ = program.homes["element"]
-        _native(state, "rgb", out, slot, bits, shown["colors"])
-        for ramp in shown["ramps"]:
-            field = program.homes[ramp.field]
-            places = slot, bits, ramp.id, int(not field[1]), *map(int, field), len(ramp.starts)
-            _native(state, "ramp", out, *places, ramp.starts, ramp.colors)
-        for tint in shown["tints"]:
-            row, column = (program.homes[piece.slot][0] for piece in program.pieces[tint.field])
-            numbers = torch.tensor([*tint.color, tint.full, tint.most])
-            _native(state, "tint", out, row, column, numbers)
-        return out
+        return self._show("rgb", state, out)
 
     @torch.no_grad()
     def matrix(self, state: State, out: Any = None) -> Tensor:
@@ -84,9 +76,7 @@ class Observer:
         channels, tables = self._channels
         out = self.buffer(out, (batch, len(channels), height, width), torch.float32)
         if isinstance(state, PackedState):
-            rows = [_native_channel(channel, at, state) for at, channel in enumerate(channels)]
-            numbers = torch.tensor(rows, dtype=torch.int32)
-            return _native(state, "channels", out, len(channels), numbers, tables)
+            return self._show("matrix", state, out)
         ids = state["element"].flatten().int()
         for at, channel in enumerate(channels):
             if channel.read:
@@ -100,6 +90,8 @@ class Observer:
         """All fields that last from step to step, as bytes: uint8 [B, C, H, W], in the order of `compact_names`."""
         batch, height, width = shape_of(state)
         out = self.buffer(out, (batch, len(self._coded), height, width), torch.uint8)
+        if isinstance(state, PackedState):
+            return self._show("compact", state, out)
         for at, (name, slot) in enumerate(self._coded):
             _write_codes(state, slot, name, out[:, at])
         return out
@@ -110,12 +102,51 @@ class Observer:
         batch, height, width = shape_of(state)
         out = self.buffer(out, (batch, len(self._bits), height, word_count(width)), torch.int64)
         if isinstance(state, PackedState):
-            places = [state.program.homes[name][0] + bit for name, bit in self._bits]
-            numbers = torch.tensor(places, dtype=torch.int32)
-            return _native(state, "planes", out, len(places), numbers)
+            return self._show("planes", state, out)
         for place, (name, bit) in enumerate(self._bits):
             out[:, place] = pack((state[name] >> bit) & 1 != 0)
         return out
+
+    def views(self, kind: str, program: NativeProgram, cells: int) -> Views:
+        """Return what native code writes for ``ids`` or a method's observations, for worlds of a number of cells."""
+        views, homes = Views(), program.homes
+        ids = homes["element"][:2]
+        match kind:
+            case "ids":
+                views.add("values", *ids, 0, 1)
+            case "rgb":
+                shown = self._looks
+                views.add("colors", *ids, tables=[shown["colors"]])
+                for ramp in shown["ramps"]:
+                    field = homes[ramp.field]
+                    numbers = *ids, ramp.id, int(not field[1]), *map(int, field), len(ramp.starts)
+                    views.add("ramp", *numbers, tables=[ramp.colors, ramp.starts])
+                for tint in shown["tints"]:
+                    parts = (homes[piece.slot][0] for piece in program.pieces[tint.field])
+                    views.add("tint", *parts, tables=[torch.tensor([*tint.color, tint.full, tint.most])])
+            case "matrix":
+                channels, tables = self._channels
+                rows = [_native_channel(channel, at, homes) for at, channel in enumerate(channels)]
+                views.add("channels", len(rows), tables=[torch.tensor(rows, dtype=torch.int32), tables])
+            case "compact":
+                for at, (name, slot) in enumerate(self._coded):
+                    numbers = homes[name]
+                    if _is_small(slot):
+                        views.add("values", *numbers, 1, int(slot.kind.lo) & 255, offset=at * cells)
+                    else:
+                        views.add("codes", *numbers, number=_floor(slot), offset=at * cells)
+            case "planes":
+                places = [homes[name][0] + bit for name, bit in self._bits]
+                views.add("planes", len(places), tables=[torch.tensor(places, dtype=torch.int32)])
+        return views
+
+    def _show(self, kind: str, state: PackedState, out: Tensor) -> Tensor:
+        """Write an observation of packed worlds into `out`; returns it."""
+        cells = prod(shape_of(state)[1:])
+        key = kind, cells
+        if key not in self._views or self._views[key][0] is not state.program:
+            self._views[key] = state.program, self.views(kind, state.program, cells)
+        return state.show(self._views[key][1], out)
 
     @cached_property
     def compact_names(self) -> tuple[str, ...]:
@@ -218,23 +249,17 @@ def _write_slot(state: State, name: str, out: Tensor) -> Tensor:
     return out.copy_(state[name])
 
 
-def _native(state: PackedState, view: str, out: Tensor, *arguments: Any) -> Tensor:
-    """Let native code write a view of worlds into `out`; returns it."""
-    write = getattr(state.program.library, f"pd_{view}")
-    values = (value.data_ptr() if isinstance(value, Tensor) else value for value in (*arguments, out))
-    write(state.handle, *values, out.stride(0))
-    return out
-
-
 def _component(state: State, name: str) -> Tensor:
     """A slot [B, H, W], or one component of a vector."""
     vector, component = component_of(name)
     return state[name] if component is None else state[vector][:, component]
 
 
-def _native_channel(channel: Channel, number: int, state: PackedState) -> tuple[int, int, int, int]:
+def _native_channel(
+    channel: Channel, number: int, homes: Mapping[str, tuple[int, int, bool]]
+) -> tuple[int, int, int, int]:
     """A channel for native code: kind, first plane or float slot, planes, value."""
-    slot, bits, signed = state.program.homes[channel.slot]
+    slot, bits, signed = homes[channel.slot]
     if not bits:
         return 4, slot, 0, 0
     if channel.read:
@@ -250,13 +275,10 @@ def _write_codes(state: State, slot: Slot, name: str, out: Tensor) -> None:
             out -= int(slot.kind.lo) & 255  # in eight bits, that is +
         return
     floor = _floor(slot)
-    if isinstance(state, PackedState) and slot.dtype == "float32" and not state.has(slot.name):
-        _native(state, "codes", out, state.program.layout.reals[name], floor)
-    else:
-        value = (_component(state, name) if slot.planes == 2 else state[name]).to(torch.float32)
-        zero = torch.tensor(floor, device=out.device).view(torch.int32)
-        size = ((value.abs() + floor).view(torch.int32) - zero + (1 << (SHIFT - 1))) >> SHIFT
-        out.copy_(128 + torch.where(value < 0, -size, size))
+    value = (_component(state, name) if slot.planes == 2 else state[name]).to(torch.float32)
+    zero = torch.tensor(floor, device=out.device).view(torch.int32)
+    size = ((value.abs() + floor).view(torch.int32) - zero + (1 << (SHIFT - 1))) >> SHIFT
+    out.copy_(128 + torch.where(value < 0, -size, size))
 
 
 def _code_values(slot: Slot) -> Tensor:

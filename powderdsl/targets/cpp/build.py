@@ -297,12 +297,7 @@ SIGNATURES = {
     "pd_store": "- piiiipl",
     "pd_put": "- piiipip",
     "pd_fill": "- piipp",
-    "pd_rgb": "- piippl",
-    "pd_tint": "- piippl",
-    "pd_ramp": "- piiiiiiiipppl",
-    "pd_channels": "- pipppl",
-    "pd_planes": "- pippl",
-    "pd_codes": "- pifpl",
+    "pd_show": "- pippl",
 }
 """The result and the arguments of each function of a library, by letters of `_TYPES`."""
 

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import ctypes
 import pickle
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -81,6 +82,45 @@ class Inputs(NamedTuple):
     reals: Tensor
 
 
+class View(ctypes.Structure):
+    """`View` of views.hpp: one part of an observation. `first` and `second` are addresses of tables."""
+
+    _fields_ = (
+        ("kind", ctypes.c_int),
+        ("numbers", ctypes.c_int * 9),
+        ("number", ctypes.c_float),
+        ("first", ctypes.c_void_p),
+        ("second", ctypes.c_void_p),
+        ("offset", ctypes.c_int64),
+    )
+
+
+VIEWS = ("values", "colors", "ramp", "tint", "channels", "codes", "planes")
+"""The kinds of views."""
+
+
+class Views:
+    """What native code writes into an observation, part by part."""
+
+    def __init__(self) -> None:
+        self.parts: list[View] = []
+        self._tables: list[Tensor] = []
+
+    def add(
+        self, kind: str, *numbers: int, number: float = 0, tables: Sequence[Tensor] = (), offset: int = 0
+    ) -> None:
+        """Add a part that begins at the byte `offset` of each world's memory."""
+        self._tables += tables
+        places = [table.data_ptr() for table in tables] + [None] * (2 - len(tables))
+        whole = (ctypes.c_int * 9)(*numbers)
+        self.parts.append(View(VIEWS.index(kind), whole, number, *places, offset))
+
+    @cached_property
+    def array(self) -> Any:
+        """All parts, as the library takes them."""
+        return (View * len(self.parts))(*self.parts)
+
+
 class PackedState(OwnedBatch):
     """A batch's state in native memory."""
 
@@ -105,6 +145,12 @@ class PackedState(OwnedBatch):
         store, size, stride = self.program.library.pd_store, out.element_size(), out.stride(0)
         for part, slot, bits, signed in self.program.parts(name, out):
             store(self.handle, slot, bits, signed, size, part.data_ptr(), stride)
+        return out
+
+    def show(self, views: Views, out: Tensor) -> Tensor:
+        """Views of the worlds, written into a tensor whose worlds are contiguous; returns it."""
+        apart = out.stride(0) * out.element_size()
+        self.program.library.pd_show(self.handle, len(views.parts), views.array, out.data_ptr(), apart)
         return out
 
     def fill(self, boxes: Tensor, values: Mapping[str, Tensor], *, reuse: bool) -> PackedState:

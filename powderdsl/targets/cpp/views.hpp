@@ -72,8 +72,15 @@ template <class Put> ALWAYS void each_run(const Grid& g, Put put) {
   for (int y = 0; y < g.height; y++)
     for (int w = 0; w < g.words; w++) put(y * g.words + w, y * g.width + BITS * w, std::min(BITS, g.width - BITS * w));
 }
-template <class T> static void store_values(const Batch& b, int slot, int bits, int negative, T* data, int64_t apart) {
-  for (int lane = 0; lane < b.lanes(); lane++) {
+// The lanes of some worlds.
+struct Lanes {
+  int first, last;
+};
+static Lanes lanes_of(const Batch& b, int first, int last) {
+  return b.g.strips ? Lanes{first * LANES, last * LANES} : Lanes{first, last};
+}
+template <class T> static void store_values(const Batch& b, Lanes some, int slot, int bits, int negative, T* data, int64_t apart) {
+  for (int lane = some.first; lane < some.last; lane++) {
     Planes p = planes_of(b.groups[lane / LANES], slot, bits, negative);
     T* out = data + b.at(lane, apart, b.g.width);
     each_run(b.g, [&](int i, int cell, int count) {
@@ -85,20 +92,22 @@ template <class T> static void store_values(const Batch& b, int slot, int bits, 
   }
 }
 static void store_real(const Grid& g, const Field* f, int lane, float* out);
-API void pd_store(const void* batch, int slot, int bits, int negative, int item, void* data, int64_t apart) {
-  const Batch& b = *(const Batch*)batch;
-  for (int lane = 0; !bits && lane < b.lanes(); lane++)
+static void store(const Batch& b, Lanes some, int slot, int bits, int negative, int item, void* data, int64_t apart) {
+  for (int lane = some.first; !bits && lane < some.last; lane++)
     store_real(b.g, b.groups[lane / LANES].real[slot], lane % LANES, (float*)data + b.at(lane, apart, b.g.width));
   if (!bits) return;
-  if (item == 1) store_values(b, slot, bits, negative, (uint8_t*)data, apart);
-  else if (item == 2) store_values(b, slot, bits, negative, (uint16_t*)data, apart);
-  else store_values(b, slot, bits, negative, (u32*)data, apart);
+  if (item == 1) store_values(b, some, slot, bits, negative, (uint8_t*)data, apart);
+  else if (item == 2) store_values(b, some, slot, bits, negative, (uint16_t*)data, apart);
+  else store_values(b, some, slot, bits, negative, (u32*)data, apart);
+}
+API void pd_store(const void* batch, int slot, int bits, int negative, int item, void* data, int64_t apart) {
+  const Batch& b = *(const Batch*)batch;
+  store(b, lanes_of(b, 0, b.worlds), slot, bits, negative, item, data, apart);
 }
 
 // Pictures: `palette` has red, green and blue of each number in its three low bytes.
-API void pd_rgb(const void* batch, int slot, int bits, const u32* palette, uint8_t* data, int64_t apart) {
-  const Batch& b = *(const Batch*)batch;
-  for (int lane = 0; lane < b.lanes(); lane++) {
+static void show_rgb(const Batch& b, Lanes some, int slot, int bits, const u32* palette, uint8_t* data, int64_t apart) {
+  for (int lane = some.first; lane < some.last; lane++) {
     Planes p = planes_of(b.groups[lane / LANES], slot, bits, 0);
     uint8_t* out = data + b.at(lane, apart, 3 * b.g.width);
     each_run(b.g, [&](int i, int cell, int count) {
@@ -133,12 +142,11 @@ ALWAYS void ramp_world(const Planes& ids, int id, int lane, const Grid& g, const
       if (found[x] == id) memcpy(out + 3 * (size_t)(cell + x), colors + (std::upper_bound(starts, starts + count, values[x]) - starts), 3);
   });
 }
-API void pd_ramp(const void* batch, int slot, int bits, int id, int is_real, int field, int field_bits, int negative, int count,
+static void show_ramp(const Batch& b, Lanes some, int slot, int bits, int id, int is_real, int field, int field_bits, int negative, int count,
                   const void* starts, const u32* colors, uint8_t* data, int64_t apart) {
-  const Batch& b = *(const Batch*)batch;
   const Grid& g = b.g;
   std::vector<float> row(is_real ? (size_t)g.height * g.width : 0);
-  for (int lane = 0; lane < b.lanes(); lane++) {
+  for (int lane = some.first; lane < some.last; lane++) {
     const Group& group = b.groups[lane / LANES];
     Planes ids = planes_of(group, slot, bits, 0);
     uint8_t* out = data + b.at(lane, apart, 3 * g.width);
@@ -158,14 +166,13 @@ API void pd_ramp(const void* batch, int slot, int bits, int id, int is_real, int
 
 // Cells in pictures, tinted by vectors: toward a color in 0..1, by the length / `full`, at most by `most`. `numbers` has the
 // color, `full` and `most`. As `tint_cells` in simulation/draw.py, operation by operation.
-API void pd_tint(const void* batch, int row, int column, const float* numbers, uint8_t* data, int64_t apart) {
-  const Batch& b = *(const Batch*)batch;
+static void show_tint(const Batch& b, Lanes some, int row, int column, const float* numbers, uint8_t* data, int64_t apart) {
   const Grid& g = b.g;
   const F full = splatf(numbers[3]), most = splatf(numbers[4]);
   float shares[256];
   for (int i = 0; i < 256; i++) shares[i] = (float)i / 255.f;
   const std::vector<float> nothing(g.stride + CHUNK, 0.f);
-  for (int lane = 0; lane < b.lanes(); lane++) {
+  for (int lane = some.first; lane < some.last; lane++) {
     const Field* parts[2] = {b.groups[lane / LANES].real[row], b.groups[lane / LANES].real[column]};
     uint8_t* out = data + b.at(lane, apart, 3 * g.width);
     for (int y = 0; y < g.height; y++, out += 3 * g.width) {
@@ -232,49 +239,91 @@ static void store_channel(const Batch& b, const Channel& c, const float* tables,
     });
   }
 }
-API void pd_channels(const void* batch, int count, const Channel* channels, const float* tables, float* data, int64_t apart) {
-  const Batch& b = *(const Batch*)batch;
-  for (int lane = 0; lane < b.lanes(); lane++)
+static void show_channels(const Batch& b, Lanes some, int count, const Channel* channels, const float* tables, float* data, int64_t apart) {
+  for (int lane = some.first; lane < some.last; lane++)
     for (int i = 0; i < count; i++)
       store_channel(b, channels[i], tables, lane, data + b.at(lane, apart, b.g.width) + (int64_t)i * b.g.world_height() * b.g.width);
 }
 
 typedef uint8_t Bytes __attribute__((vector_size(CHUNK), may_alias));
 // Reals in eight bits: 128 is 0, further from it in steps that grow with the value. `floor` is a power of two.
-API void pd_codes(const void* batch, int slot, float floor, uint8_t* data, int64_t apart) {
-  const Batch& b = *(const Batch*)batch;
-  int32_t one;
-  memcpy(&one, &floor, 4);
-  for (int lane = 0; lane < b.lanes(); lane++) {
-    const Field* f = b.groups[lane / LANES].real[slot];
+ALWAYS void codes_of(const float* in, int count, float floor, uint8_t* out) {  // reads up to a whole chunk
+  int32_t least;
+  memcpy(&least, &floor, 4);
+  for (int x = 0; x < count; x += CHUNK) {
+    F value = (F)*(const Fu*)(in + x);
+    I bits = (I)value, sign = bits >> 31;
+    I size = ((I)((F)(bits & 0x7fffffff) + floor) - least + (1 << 19)) >> 20;
+    Bytes codes = __builtin_convertvector(((size ^ sign) - sign) + 128, Bytes);
+    memcpy(out + x, &codes, std::min(CHUNK, count - x));
+  }
+}
+static void show_codes(const Batch& b, Lanes some, int slot, int bits, int negative, float floor, uint8_t* data, int64_t apart) {
+  for (int lane = some.first; lane < some.last; lane++) {
+    const Group& group = b.groups[lane / LANES];
     uint8_t* out = data + b.at(lane, apart, b.g.width);
+    if (bits) {
+      Planes p = planes_of(group, slot, bits, negative);
+      each_run(b.g, [&](int i, int cell, int count) {
+        int32_t numbers[64];
+        float values[64];
+        cells_of(p, lane % LANES, i, (u32*)numbers);
+        std::copy_n(numbers, 64, values);
+        codes_of(values, count, floor, out + cell);
+      });
+      continue;
+    }
+    const Field* f = group.real[slot];
     for (int y = 0; y < b.g.height; y++, out += b.g.width) {
       size_t row = (size_t)(lane % LANES) * b.g.height + y;
-      if (!f->live[row]) {
-        memset(out, 128, b.g.width);
-        continue;
-      }
-      const float* in = f->data + row * b.g.stride + HALO;
-      for (int x = 0; x < b.g.width; x += CHUNK) {  // rows go on behind the last column
-        F value = (F)*(const Fu*)(in + x);
-        I bits = (I)value, sign = bits >> 31;
-        I size = ((I)((F)(bits & 0x7fffffff) + floor) - one + (1 << 19)) >> 20;
-        Bytes codes = __builtin_convertvector(((size ^ sign) - sign) + 128, Bytes);
-        memcpy(out + x, &codes, std::min(CHUNK, b.g.width - x));
-      }
+      if (f->live[row]) codes_of(f->data + row * b.g.stride + HALO, b.g.width, floor, out);  // rows go on behind the last column
+      else memset(out, 128, b.g.width);
     }
   }
 }
 
 // Planes as they are: [plane][row][word] of each world.
-API void pd_planes(const void* batch, int count, const int* slots, u64* data, int64_t apart) {
-  const Batch& b = *(const Batch*)batch;
-  for (int lane = 0; lane < b.lanes(); lane++)
+static void show_planes(const Batch& b, Lanes some, int count, const int* slots, u64* data, int64_t apart) {
+  for (int lane = some.first; lane < some.last; lane++)
     for (int k = 0; k < count; k++) {
       const Plane* p = b.groups[lane / LANES].slot[slots[k]];
       u64* out = data + b.at(lane, apart, b.g.words) + (int64_t)k * b.g.world_height() * b.g.words;
       for (int i = 0; i < b.g.cells(); i++) out[i] = word_of(p, lane % LANES, i);
     }
+}
+
+// One part of an observation: what is shown, from the byte `offset` of each world's memory on.
+struct View {
+  int kind;  // 0 the values of a slot less a[4], 1 colors, 2 a ramp, 3 a tint, 4 channels, 5 codes of reals, 6 planes
+  int a[9];
+  float number;
+  const void *first, *second;
+  int64_t offset;
+};
+// `apart`: bytes from one world's memory to the next's.
+static void show(const Batch& b, Lanes some, const View& v, uint8_t* out, int64_t apart) {
+  const int* a = v.a;
+  uint8_t* data = out + v.offset;
+  const u32* colors = (const u32*)v.first;
+  switch (v.kind) {
+    case 0:
+      store(b, some, a[0], a[1], a[2], a[3], data, apart / a[3]);
+      for (int lane = some.first; a[4] && lane < some.last; lane++) {
+        uint8_t* cell = data + b.at(lane, apart, b.g.width);
+        for (int i = 0; i < b.g.height * b.g.width; i++) cell[i] -= a[4];
+      }
+      return;
+    case 1: return show_rgb(b, some, a[0], a[1], colors, data, apart);
+    case 2: return show_ramp(b, some, a[0], a[1], a[2], a[3], a[4], a[5], a[6], a[7], v.second, colors, data, apart);
+    case 3: return show_tint(b, some, a[0], a[1], (const float*)v.first, data, apart);
+    case 4: return show_channels(b, some, a[0], (const Channel*)v.first, (const float*)v.second, (float*)data, apart / 4);
+    case 5: return show_codes(b, some, a[0], a[1], a[2], v.number, data, apart);
+    default: return show_planes(b, some, a[0], (const int*)v.first, (u64*)data, apart / 8);
+  }
+}
+API void pd_show(const void* batch, int count, const View* views, uint8_t* out, int64_t apart) {
+  const Batch& b = *(const Batch*)batch;
+  for (int i = 0; i < count; i++) show(b, lanes_of(b, 0, b.worlds), views[i], out, apart);
 }
 
 // Numbers of cells where masks hold. A gate is a plane of the batch, a mask, or an operation on earlier gates. Masks are

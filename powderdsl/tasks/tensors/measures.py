@@ -138,7 +138,9 @@ class Meter:
             torch.stack(sizes, 1) if sizes else torch.zeros(1, 0, dtype=torch.float64),
         )
 
-    def _sizes(self, measure: Measure, regions: Mapping[str, Tensor], targets: Mapping[str, Tensor]) -> Tensor:
+    def _sizes(
+        self, measure: Measure, regions: Mapping[str, Tensor], targets: Mapping[str, Tensor]
+    ) -> Tensor:
         """Return what the sum of a measure is divided by: float64 [B or 1]."""
         if measure.target is not None:
             size = (targets[measure.target] != NOTHING).sum((1, 2))
@@ -179,7 +181,9 @@ class Meter:
                     bits, signed = types[name].bits, types[name].signed
                     for bit in range(bits):
                         weight = float(-(1 << bit) if signed and bit == bits - 1 else 1 << bit)
-                        counted.append(Counted(flags[plane_name(name, bit)], i, measure.region, False, weight))
+                        counted.append(
+                            Counted(flags[plane_name(name, bit)], i, measure.region, False, weight)
+                        )
             return CellCounts(counted, len(self.measures), program.layout.planes, masks, self._rows(numbers))
         except (NotBits, KeyError, ValueError):
             return None  # floats, neighbors, too many gates: tensors show them
@@ -199,7 +203,9 @@ class Meter:
         regions = [str(self.measures[number].region) for number in numbers]
         if not regions or not {*regions} <= self._fixed.keys():
             return 0, self.size[0]
-        rows = torch.cat([self._fixed[name] for name in regions]).any(2).any(0).nonzero()[:, 0].tolist() or [0]
+        rows = torch.cat([self._fixed[name] for name in regions]).any(2).any(0).nonzero()[:, 0].tolist() or [
+            0
+        ]
         return rows[0], rows[-1] + 1
 
     def cells(self, number: int, world: World, regions: Mapping[str, Tensor]) -> Tensor:
