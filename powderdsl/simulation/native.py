@@ -100,9 +100,9 @@ class ByWidth:
         if code is None:
             segments()  # reports rules that cannot be lowered
         if first is not None:
-            self._latest = self._of(0 if code is None else code.width)
+            self._latest = self.of(0 if code is None else code.width)
 
-    def _of(self, width: int) -> Runnable:
+    def of(self, width: int) -> Runnable:
         if width in self._programs:
             return self._programs[width]
         recall, compile = partial(self._recall, width), partial(self._compile, width)
@@ -140,6 +140,13 @@ class ByWidth:
                 remember(start_key(self._ruleset), program.code)
         return program
 
+    def native(self, width: int) -> NativeProgram | None:
+        """Return the native code for grids of a width that runs all passes, if it has been compiled."""
+        program: Runnable | None = self.of(known_width(width))
+        if isinstance(program, AutoProgram):
+            program = program.native
+        return program if isinstance(program, NativeProgram) else None
+
     @property
     def running(self) -> str:
         """The backend of the next step: ``wasm``, ``torch`` or ``native``."""
@@ -151,7 +158,7 @@ class ByWidth:
         return tuple(getattr(self._latest, "notes", ()))
 
     def run(self, job: Job) -> Mapping[str, Array]:
-        self._latest = program = self._of(known_width(shape_of(job.state)[-1]))
+        self._latest = program = self.of(known_width(shape_of(job.state)[-1]))
         return program.run(job)
 
 
@@ -195,6 +202,11 @@ class AutoProgram:
     def running(self) -> str:
         """The backend of the next step: ``wasm``, ``torch`` or ``native``."""
         return self._name if self._native is None else "native"
+
+    @property
+    def native(self) -> Runnable | None:
+        """Native code, once it has been compiled."""
+        return self._native
 
     @property
     def notes(self) -> tuple[str, ...]:

@@ -42,6 +42,7 @@ from powderdsl.targets.job import Clock, Job, PassClock, shape_of
 
 if TYPE_CHECKING:
     from powderdsl.simulation.observe import Observer
+    from powderdsl.targets.cpp.program import NativeProgram
 
 MAX_CELLS = 1 << 31
 LAST_STEP = (1 << 63) - 1
@@ -264,6 +265,11 @@ class Simulator:
         if self.backend == "auto" and self.running == "wasm" and self.kind.xp.__name__ != "torch":
             return ("wasm: native code takes torch and more work, or --backend native",)
         return tuple(getattr(self._program.whole, "notes", ()))
+
+    def native(self, width: int) -> NativeProgram | None:
+        """Return the native code for grids of a width that runs all passes, if it has been compiled."""
+        find = getattr(self._program.whole, "native", None)
+        return None if find is None else find(width)
 
     @cached_property
     def observer(self) -> Observer:

@@ -80,6 +80,10 @@ class PackedArrays(Mapping[str, Array]):
             self._arrays[name] = self.unpack(name)
         return self._arrays[name]
 
+    def forget(self) -> None:
+        """Unpack again on the next access: the backend has written to the memory."""
+        self._arrays.clear()
+
     def has(self, name: str) -> bool:
         """True if a slot's array has been unpacked."""
         return name in self._arrays

@@ -67,17 +67,17 @@ class TaskProgram:
         self._starts = StartWorlds(task, split, simulator.kind)
         scalars = scalars_of(task.goal)
         self.measures = measures_in(scalars)
-        self._places = {measure: number for number, measure in enumerate(self.measures)}
-        self._fixed = self._starts.fixed
+        self.measure_numbers = {measure: number for number, measure in enumerate(self.measures)}
+        self.fixed = self._starts.fixed
         """Regions that are the same in all worlds of the split, bool [1, H, W]."""
-        self._meter = Meter(simulator.ruleset, self.measures, task.size, self._fixed, device)
+        self.meter = Meter(simulator.ruleset, self.measures, task.size, self.fixed, device)
         goal = task.goal
         asks_now = (goal.each, goal.success, goal.failure) != (None, None, None)
-        self._counts_always = asks_now or any(part.op == "before" for part in scalars)
+        self.counts_always = asks_now or any(part.op == "before" for part in scalars)
         """Whether measures are needed after every action, and not only after the last."""
         self._asked = {part.value for part in scalars if part.op == "action"}
         """The numbers of actions that the goal reads."""
-        self._hands = Hands(simulator, task.agent, task.size, counts="painted" in self._asked)
+        self.hands = Hands(simulator, task.agent, task.size, counts="painted" in self._asked)
         self.action_nvec = task.agent.action_nvec
         """How many values x, y, choice, vx and vy have. `Task.agent.choices` says what a choice means."""
 
@@ -93,12 +93,12 @@ class TaskProgram:
         starts = self._starts.make(seeds)
         nothing = torch.zeros_like(seeds)
         clock = (seeds, nothing.clone(), nothing.clone())
-        state = self._hands.fresh_state(starts.ids)
+        state = self.hands.fresh_state(starts.ids)
         for name, (values, where) in starts.fields.items():
             state[name] = torch.where(where if values.ndim == 3 else where[:, None], values, state[name])
         world = World(self.simulator, state, *clock)
-        masks = self._meter.masks(starts.regions, starts.targets)
-        measured = self._meter.take(world, starts.regions, starts.targets, None, masks)
+        masks = self.meter.masks(starts.regions, starts.targets)
+        measured = self.meter.take(world, starts.regions, starts.targets, None, masks)
         flags, maps = nothing.bool(), (starts.regions, starts.targets, masks)
         return Episodes(world, seeds, nothing.clone(), flags, *maps, measured, measured)
 
@@ -119,7 +119,7 @@ class TaskProgram:
         def placed(old: Mapping[str, Tensor], fresh: Mapping[str, Tensor]) -> dict[str, Tensor]:
             return {name: put_rows(value, places, fresh[name], reuse) for name, value in old.items()}
 
-        own = {name: value for name, value in episodes.regions.items() if name not in self._fixed}
+        own = {name: value for name, value in episodes.regions.items() if name not in self.fixed}
         return Episodes(
             put_worlds(episodes.world, places, new.world, reuse=reuse),
             regions={**episodes.regions, **placed(own, new.regions)},
@@ -151,12 +151,12 @@ class TaskProgram:
         if set(state) != names or tuple(state["element"].shape[1:]) != self.task.size:
             raise ValueError(f"these episodes are not of {self.task.name}: another state, or another size")
         seed, index, step = (_copy(part, device) for part in saved["clock"])
-        regions, targets = {**tensors(saved["regions"]), **self._fixed}, tensors(saved["targets"])
+        regions, targets = {**tensors(saved["regions"]), **self.fixed}, tensors(saved["targets"])
         return Episodes(
             world=World(self.simulator, state, seed, index, step),
             regions=regions,
             targets=targets,
-            masks=self._meter.masks(regions, targets),
+            masks=self.meter.masks(regions, targets),
             **tensors({name: saved[name] for name in ROWS}),
         )
 
@@ -188,7 +188,7 @@ class TaskProgram:
         agent, goal = self.task.agent, self.task.goal
         world = episodes.world
         if actions is not None:
-            world, done = self._hands.act(world, actions, reuse=reuse)
+            world, done = self.hands.act(world, actions, reuse=reuse)
         else:
             done = dict.fromkeys(DONE, torch.zeros_like(episodes.acted))
         if seen is not None:
@@ -199,12 +199,12 @@ class TaskProgram:
         if agent.free_steps:
             world = self._free(world, last, params, seen)
         now = episodes.before
-        if self._counts_always or bool(last.any()):
-            now = self._meter.take(world, episodes.regions, episodes.targets, params, episodes.masks)
+        if self.counts_always or bool(last.any()):
+            now = self.meter.take(world, episodes.regions, episodes.targets, params, episodes.masks)
         action = {"taken": acted, **done}
         if "left" in self._asked:
             action["left"] = agent.actions - acted
-        facts = Facts(self._places, now, episodes.start, episodes.before, action)
+        facts = Facts(self.measure_numbers, now, episodes.start, episodes.before, action)
         success, failed = (
             torch.zeros_like(last) if scalar is None else scalar_value(scalar, facts) != 0
             for scalar in (goal.success, goal.failure)
@@ -225,11 +225,11 @@ class TaskProgram:
     @property
     def block_edges(self) -> tuple[Tensor, Tensor]:
         """The rows, then the columns, of the blocks that actions change: first and past the last, int64 [bins, 2]."""
-        return self._hands.blocks.edges
+        return self.hands.blocks.edges
 
     def measured(self, episodes: Episodes, params: Params = None) -> Tensor:
         """The current values of `measures`: float64 [B, n]."""
-        return self._meter.take(episodes.world, episodes.regions, episodes.targets, params, episodes.masks)
+        return self.meter.take(episodes.world, episodes.regions, episodes.targets, params, episodes.masks)
 
     def _run(self, world: World, steps: int, params: Params, reuse: bool, seen: Seen) -> World:
         """The worlds after some steps, which run one at a time if they are to be seen."""

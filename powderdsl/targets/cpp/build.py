@@ -298,6 +298,10 @@ SIGNATURES = {
     "pd_put": "- piiipip",
     "pd_fill": "- piipp",
     "pd_show": "- pippl",
+    "pd_act": "l pp",
+    "pd_finish": "i p",
+    "pd_begin": "- p",
+    "pd_play": "l pp",
 }
 """The result and the arguments of each function of a library, by letters of `_TYPES`."""
 

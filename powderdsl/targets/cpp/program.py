@@ -202,10 +202,10 @@ class NativeProgram:
         """The state `job.steps` later. Jobs with given draws or chosen passes are for other backends."""
         state, (seed, index, start, since) = job.state, job.clock
         seed, index, start = seed.contiguous(), index.contiguous(), start.contiguous()
-        inputs = self._inputs.get(id(job.params)) or self._make_inputs(job.params, len(start))
+        inputs = self.inputs(job.params, len(start))
         reuse = job.reuse
         if not (isinstance(state, PackedState) and state.program is self):
-            state, reuse = self._pack(state), True
+            state, reuse = self.pack(state), True
         handle = state.take() if reuse else state.handle
         seconds = None if job.timing is None else (ctypes.c_double * len(self.code.passes))()
         handle = self.library.pd_run(
@@ -217,8 +217,10 @@ class NativeProgram:
                 job.timing.add(name, spent)
         return PackedState(self, handle, state.like)
 
-    def _make_inputs(self, params: Mapping[str, Tensor], batch: int) -> Inputs:
+    def inputs(self, params: Mapping[str, Tensor], batch: int) -> Inputs:
         """The inputs of some parameters, kept for the next call with the same mapping."""
+        if (known := self._inputs.get(id(params))) is not None:
+            return known
         layout = self.layout
         bits, floats = parameters(torch, params, layout.param_planes, layout.param_reals, batch)
         if len(self._inputs) >= KEPT_INPUTS:
@@ -226,7 +228,8 @@ class NativeProgram:
         self._inputs[id(params)] = inputs = Inputs(params, bits, floats)
         return inputs
 
-    def _pack(self, state: Mapping[str, Tensor]) -> PackedState:
+    def pack(self, state: Mapping[str, Tensor]) -> PackedState:
+        """A state in native memory."""
         handle: int = self.library.pd_new(*shape_of(state))
         for name, value in state.items():
             value = value.contiguous()

@@ -13,12 +13,12 @@ from powderdsl.system.cache import collection_paused
 from powderdsl.targets.cpp.text import pass_text
 from powderdsl.targets.layout import NativeLayout, braced, literal, native_layout
 
-GENERATOR_VERSION = 12
+GENERATOR_VERSION = 13
 """Part of every cache key; increase it when generated code changes meaning."""
 
 LIBRARY = ("vectors", "runtime", "planes", "movements", "fields")
 """Headers before the generated passes, in this order."""
-DRIVER = ("driver", "views")
+DRIVER = ("driver", "views", "episodes")
 """Headers after the generated passes."""
 
 UNIT_SIZE = 40_000

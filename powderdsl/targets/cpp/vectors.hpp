@@ -5,12 +5,14 @@
 // Reals lie by world and row, with a halo of wrapped columns on both sides. Nothing here knows any rule.
 #include <algorithm>
 #include <atomic>
+#include <cmath>
 #include <condition_variable>
 #include <cstdint>
 #include <cstdlib>
 #include <cstring>
 #include <ctime>
 #include <functional>
+#include <limits>
 #include <mutex>
 #include <thread>
 #include <vector>

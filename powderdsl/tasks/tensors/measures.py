@@ -82,6 +82,8 @@ class Meter:
         named = {measure.region for measure in measures if measure.region is not None}
         self._regions = sorted(named | {name.removeprefix(REGION_LET) for name in _lets(measures)})
         self._targets = sorted({measure.target for measure in measures if measure.target is not None})
+        self.own = bool(self._targets) or not {*self._regions} <= fixed.keys()
+        """Whether each world has masks of its own."""
 
     def take(
         self,

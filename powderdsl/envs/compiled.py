@@ -1,0 +1,183 @@
+"""Environments whose step is one call of native code: actions, simulation, rewards, ends, new episodes, observations."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from gymnasium.vector import AutoresetMode
+from torch import Tensor
+
+from powderdsl.envs.tensor_env import (
+    Info,
+    TensorEnv,
+    check_going,
+    reset_mask,
+    world_seeds,
+)
+from powderdsl.tasks.compiled import EMPTY, Results, Stepper
+
+Steps = tuple[Any, Any, Any, Any, dict[str, Any]]
+"""Observations, reward, terminated, truncated and infos: arrays."""
+
+
+class CompiledEnv(TensorEnv):
+    """A `TensorEnv`, to the bit, that steps by one call where its rules run as native code, and else as `TensorEnv` does.
+
+    Measures that bit planes do not show (`Stepper.measures_cells`) are taken of tensors, between two calls.
+    """
+
+    _stepper: Stepper | None = None
+    _bound: tuple[Any, Any] = (None, None)
+    """The episodes and parameters that the stepper steps."""
+
+    def _ready(self) -> Stepper | None:
+        """Return what steps the current episodes; None if they do not run as native code."""
+        if self.episodes is self._bound[0] and self.params is self._bound[1]:
+            return self._stepper
+        self._bound = None, None
+        native = self.simulator.native(self.task.size[1])
+        if native is None or self.episodes is None:
+            return None
+        if self._stepper is None or self._stepper.native is not native:
+            form, space = self.action_form, self.observation.space
+            cells = self.task.size[0] * self.task.size[1]
+            self._stepper = Stepper(
+                self.program,
+                native,
+                self.simulator.observer.views(self.observation.kind, native, cells),
+                int(np.prod(space.shape)) * space.dtype.itemsize,
+                self.autoreset_mode.name,
+                self.max_episode_steps,
+                self.last_action_terminates,
+                form.nvec,
+                None if form.kind == "discrete" else form.columns,
+                form.table,
+            )
+            self._results: list[Results] = []
+        params = self.simulator.parameters(self.params, self.num_envs)
+        kept = {"episode": self._episode, "returned": self._returned, "waiting": self._ended}
+        self.episodes = self._stepper.bind(self.episodes, params, kept)
+        self._waiting = self._ended.numpy()
+        self._bound = self.episodes, self.params
+        return self._stepper
+
+    def reset(
+        self, *, seed: int | Sequence[int | None] | None = None, options: Mapping[str, Any] | None = None
+    ) -> tuple[Tensor, Info]:
+        """Begin all episodes, or those of a mask: see `TensorEnv.reset`."""
+        known = self.episodes is not None and self.episodes is self._bound[0]
+        if not known or seed is not None or (options and options.keys() != {"reset_mask"}):
+            base = self._base
+            result = super().reset(seed=seed, options=options)
+            if self._stepper is not None and self._stepper.filled is not None and base is not None:
+                self._stepper.filled[self._base != base] = 0  # made for other seeds
+            return result
+        stepper, nobody = self._ready(), torch.zeros(self.num_envs, dtype=torch.bool)
+        assert stepper is not None
+        mask = reset_mask((options or {}).get("reset_mask"), self.num_envs, True, self.device)
+        stepper.begins.copy_(mask)
+        stepper.fill(self._numbers)
+        self._ended &= ~mask
+        observed = self._new_results(stepper).observed
+        stepper.begin()
+        info: Info = {"success": nobody, "_success": nobody.clone()}
+        self._add_ended(info, nobody)
+        self._add_shown(info, mask)
+        return torch.from_numpy(observed), info
+
+    def _numbers(self, rows: Tensor, episodes: Tensor) -> Tensor:
+        """Return the numbers of the worlds that rows play in episodes: int64 [n]."""
+        assert self._base is not None
+        return world_seeds(self._base[rows], episodes, self.worlds)
+
+    def _new_results(self, stepper: Stepper) -> Results:
+        """Return results that nobody holds, which the next call writes to."""
+        results = next((results for results in self._results if results.is_free), None)
+        if results is None:
+            space = self.observation.space
+            keeps_last = self.autoreset_mode is AutoresetMode.SAME_STEP
+            results = Results(self.num_envs, space.shape, space.dtype, keeps_last)
+            self._results = [results, *self._results[:2]]
+        stepper.write_to(results)
+        return results
+
+    def step(self, actions: Any) -> tuple[Tensor, Tensor, Tensor, Tensor, Info]:
+        """Act once in every episode: see `TensorEnv.step`."""
+        if self._ready() is None:
+            return super().step(actions)
+        *parts, info = self.step_arrays(actions)
+        observed, reward, terminated, truncated = map(torch.from_numpy, parts)
+        return observed, reward, terminated, truncated, tensors_of(info)
+
+    def step_arrays(self, actions: Any) -> Steps:
+        """Act once in every episode: `step` with NumPy arrays."""
+        stepper = self._ready()
+        if stepper is None:
+            *parts, shown = super().step(actions)
+            observed, reward, terminated, truncated = (part.cpu().numpy() for part in parts)
+            return observed, reward, terminated, truncated, arrays_of(shown)
+        self._read(actions, stepper.numbers)
+        mode = self.autoreset_mode
+        if mode is AutoresetMode.DISABLED and self._waiting.any():
+            check_going(self._ended)
+        results = self._new_results(stepper)
+        results.everyone.fill(True)
+        active = ~self._waiting if mode is AutoresetMode.NEXT_STEP else results.everyone
+        status = stepper.step()
+        if status >= 0:
+            self.action_form.decode(actions)  # raises ValueError
+            raise AssertionError(f"action {status} is out of range")
+        if status == EMPTY:
+            stepper.fill(self._numbers)
+            stepper.begin()
+        ended = results.ended
+        info: dict[str, Any] = {
+            "success": results.success,
+            "_success": active,
+            "episode_return": results.episode_return,
+            "episode_length": results.episode_length,
+            "_episode_return": ended,
+            "_episode_length": ended,
+            "world": results.world,
+            "_world": results.everyone,
+        }
+        if results.last_observed is not None:
+            names = ("success", "episode_return", "episode_length")
+            final = {"world": results.last_world, **{name: info[name] for name in names}}
+            info["final_info"] = final | {f"_{name}": ended for name in final}
+            info["final_obs"] = results.last_observed[: np.count_nonzero(ended)]
+            info["_final_obs"] = info["_final_info"] = ended
+        if self.shows_mask:
+            info["action_mask"] = self.action_masks().to(torch.int8).numpy()
+            info["_action_mask"] = results.everyone
+        return results.observed, results.reward, results.terminated, results.truncated, info
+
+    def _read(self, actions: Any, numbers: Any) -> None:
+        """Write actions into `numbers`, int64 [B, k]. Raises TypeError and ValueError as `TensorEnv.step`."""
+        given = actions.numpy() if isinstance(actions, Tensor) else actions
+        shape = numbers.shape[: 1 if self.action_form.kind == "discrete" else 2]
+        if not isinstance(given, np.ndarray) or given.dtype.kind not in "iu" or given.shape != shape:
+            checked = self.action_form.decode(actions)
+            if len(checked) != self.num_envs:
+                raise ValueError(f"{len(checked)} actions for {self.num_envs} environments")
+            given = np.asarray(actions)
+        np.copyto(numbers, given.reshape(numbers.shape), casting="unsafe")
+
+
+def arrays_of(info: Info) -> dict[str, Any]:
+    """The infos of a `TensorEnv` as arrays; from a device they are copied."""
+    return {
+        name: arrays_of(value) if isinstance(value, dict) else value.cpu().numpy()
+        for name, value in info.items()
+    }
+
+
+def tensors_of(info: Mapping[str, Any]) -> Info:
+    """Infos of arrays as tensors of the same memory."""
+    return {
+        name: tensors_of(value) if isinstance(value, dict) else torch.from_numpy(value)
+        for name, value in info.items()
+    }

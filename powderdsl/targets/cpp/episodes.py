@@ -1,0 +1,50 @@
+"""The layout of what a library needs to step the episodes of a task in one call: `Play` of episodes.hpp."""
+
+from __future__ import annotations
+
+import ctypes
+from typing import Any
+
+MODES = ("SAME_STEP", "NEXT_STEP", "DISABLED")
+
+OPS = (
+    "const", "measure", "start", "before", "action", "neg", "abs", "not", "choose", "add", "sub", "mul", "and",
+    "div", "quotient", "mod", "min", "max", "or", "lt", "le", "eq",
+)  # fmt: skip
+"""Operations of formulas, by their numbers."""
+
+ACTION_NUMBERS = ("taken", "left", "painted", "placed", "blown")
+"""Numbers of an action that formulas read, in the order of their rows."""
+
+
+class Formula(ctypes.Structure):
+    """An expression as operations on a stack."""
+
+    _fields_ = (("count", ctypes.c_int64), ("ops", ctypes.c_void_p))
+
+
+class Fresh(ctypes.Structure):
+    """What a placed element sets in a slot, by the agent's choice: int64, or float32 if there are no bits."""
+
+    _fields_ = (("slot", ctypes.c_int64), ("bits", ctypes.c_int64), ("values", ctypes.c_void_p))
+
+
+def _whole(names: str) -> tuple[tuple[str, Any], ...]:
+    return tuple((name, ctypes.c_int64) for name in names.split())
+
+
+class Play(ctypes.Structure):
+    """Everything that a step reads and writes. Addresses are those of arrays that the caller keeps."""
+
+    _fields_ = (
+        *_whole("threads steps free_steps actions limit mode last_terminates counts_always"),
+        *_whole("numbers most column table row_edges column_edges choices"),
+        *_whole("fresh_count counts_painted element element_bits speed_row speed_column fresh"),
+        ("speed", ctypes.c_double),
+        *_whole("batch seed index step param_planes param_reals"),
+        *_whole("world acted episode failed waiting start before now returned"),
+        *_whole("counts masks sizes measures mask_words own_masks"),
+        *((name, Formula) for name in ("each", "final", "success", "failure")),
+        *_whole("pool depth pool_world filled pool_start pool_sizes pool_masks"),
+        *_whole("views size view observed last_observed results action begins counted"),
+    )

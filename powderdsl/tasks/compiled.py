@@ -1,0 +1,328 @@
+"""A task's episodes, stepped by one call of native code: the same as `TaskProgram.act` and what environments do after it.
+
+`Stepper` lays out what the call reads and writes. Tensors of the episodes are written in place.
+"""
+
+from __future__ import annotations
+
+import ctypes
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import replace
+from itertools import pairwise
+from sys import getrefcount
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from powderdsl.model.types import Expr
+from powderdsl.simulation.simulator import World
+from powderdsl.targets.cpp.episodes import ACTION_NUMBERS, MODES, OPS, Fresh, Play
+from powderdsl.targets.cpp.program import NativeProgram, PackedState, Views
+from powderdsl.tasks.episodes import Episodes, TaskProgram
+from powderdsl.tasks.tensors.measures import Masks
+
+POOL_CELLS = 1 << 22
+"""Cells of the start worlds that are made ahead, about: many small worlds, or few large ones."""
+
+MOST_AHEAD = 64
+"""Start worlds that are made ahead for each episode, at most."""
+
+READY, EMPTY = -1, -2
+"""Results of `pd_play`: done, or start worlds have to be made before `pd_begin`."""
+
+
+_OP = np.dtype([("op", "i8"), ("number", "i8"), ("value", "f8")])
+
+
+def operations(scalar: Expr | None, measures: Mapping[Any, int]) -> Any:
+    """Return the operations of an expression, arguments first; none of None. `measures` numbers those it reads."""
+    return np.array([] if scalar is None else [*_operations(scalar, measures, "measure")], _OP)
+
+
+def _operations(scalar: Expr, measures: Mapping[Any, int], when: str) -> Iterator[tuple[int, int, float]]:
+    """Yield operations. `when`: the operation that reads a measure, now or earlier."""
+    match scalar.op:
+        case "const":
+            yield OPS.index("const"), 0, float(scalar.value)
+        case "measure":
+            yield OPS.index(when), measures[scalar.value], 0
+        case "action":
+            yield OPS.index("action"), ACTION_NUMBERS.index(scalar.value), 0
+        case "start" | "before":
+            yield from _operations(scalar.args[0], measures, scalar.op)
+        case _:
+            for arg in scalar.args:
+                yield from _operations(arg, measures, when)
+            yield OPS.index(scalar.op), 0, 0
+
+
+class Results:
+    """What a step gives, a row for each world: see `Results` of episodes.hpp.
+
+    Fresh memory from the system costs more than a step, so results that nobody else holds are written again.
+
+    Args:
+        worlds: the number of worlds.
+        shape: of one observation.
+        dtype: of observations.
+        keeps_last: whether there are last observations of episodes besides the first ones of the next.
+    """
+
+    def __init__(self, worlds: int, shape: tuple[int, ...], dtype: Any, keeps_last: bool):
+        memory = np.empty(36 * worlds, np.uint8)
+        kinds = (*[np.int64] * 3, *[np.float32] * 2, *[np.bool_] * 4)
+        ends = np.cumsum([0] + [worlds * np.dtype(kind).itemsize for kind in kinds])
+        rows: list[Any] = [memory[a:b].view(kind) for (a, b), kind in zip(pairwise(ends), kinds, strict=True)]
+        self.episode_length, self.world, self.last_world, self.reward, self.episode_return = rows[:5]
+        self.terminated, self.truncated, self.success, self.ended = rows[5:]
+        self.everyone = np.ones(worlds, np.bool_)
+        self.observed = np.empty((worlds, *shape), dtype)
+        self.last_observed = np.empty((worlds, *shape), dtype) if keeps_last else None
+        self._arrays = [memory, *rows, self.everyone, self.observed]
+        if self.last_observed is not None:
+            self._arrays.append(self.last_observed)
+        self.addresses = {"results": memory.ctypes.data, "observed": self.observed.ctypes.data}
+        self.addresses["last_observed"] = 0 if self.last_observed is None else self.last_observed.ctypes.data
+        del memory, rows
+        self._counts: list[int] = []
+        self._counts = self._references()
+
+    def _references(self) -> list[int]:
+        return [*map(getrefcount, self._arrays)]
+
+    @property
+    def is_free(self) -> bool:
+        """Whether nobody holds an array, or a view of one."""
+        return self._references() == self._counts
+
+
+class Stepper:
+    """Steps a batch of episodes of one task program in native code.
+
+    Args:
+        program: the task.
+        native: the code of its rules, for its width.
+        views: what an observation shows, of `size` bytes a world.
+        mode: the name of an autoreset mode.
+        limit: actions after which an episode is truncated.
+        last_terminates: whether the task's last action terminates.
+        most: how many values each number of an action has.
+        columns: which of the five numbers they are; or of one number, None.
+        table: the five numbers of each value of one number, int64 [n, 5].
+    """
+
+    def __init__(
+        self,
+        program: TaskProgram,
+        native: NativeProgram,
+        views: Views,
+        size: int,
+        mode: str,
+        limit: int,
+        last_terminates: bool,
+        most: tuple[int, ...],
+        columns: Tensor | None,
+        table: Tensor,
+    ):
+        self.program, self.native, self.views = program, native, views
+        self._kept: list[Any] = []
+        """Arrays whose addresses are in `play`."""
+        agent, goal, hands = program.task.agent, program.task.goal, program.hands
+        self.counts = program.meter.counts(native)
+        counted = 0 if self.counts is None else len(self.counts.numbers)
+        self.measures_cells = counted < len(program.measures)
+        """Whether some measures are taken of tensors, between two parts of a step."""
+        self.filled: Tensor | None = None
+        """int64 [B]: the first episode of each row whose start world has not been made."""
+        self._ahead: Episodes | None = None
+        self.play = play = Play(
+            threads=native.threads,
+            steps=agent.steps_per_action,
+            free_steps=agent.free_steps,
+            actions=agent.actions,
+            limit=limit,
+            mode=MODES.index(mode),
+            last_terminates=last_terminates,
+            counts_always=program.counts_always,
+            numbers=len(most),
+            speed=agent.speed,
+            measures=len(program.measures),
+            views=len(views.parts),
+            view=ctypes.addressof(views.array),
+            size=size,
+            counts=0 if self.counts is None else ctypes.addressof(self.counts.plan),
+            counts_painted=hands.counts,
+        )
+        self._play = ctypes.byref(play)
+        self._has_maps = False
+        play.most = self._address(np.array(most, np.int64))
+        if columns is None:
+            play.table = self._address(table)
+        else:
+            play.column = self._address(columns)
+        play.row_edges, play.column_edges = map(self._address, hands.blocks.edges)
+        play.choices = self._address(np.array(agent.choices, np.int64))
+        play.element, play.element_bits, _ = native.homes["element"]
+        fresh = list(self._fresh_values())
+        play.fresh_count, play.fresh = len(fresh), self._address((Fresh * len(fresh))(*fresh))
+        speeds = [] if agent.speed_field is None else native.pieces[agent.speed_field]
+        play.speed_row, play.speed_column = [native.homes[piece.slot][0] for piece in speeds] or (-1, -1)
+        for name in ("each", "final", "success", "failure"):
+            steps = operations(getattr(goal, name), program.measure_numbers)
+            getattr(play, name).count, getattr(play, name).ops = len(steps), self._address(steps)
+
+    def _address(self, values: Any) -> int:
+        """Return the address of an array, which is kept."""
+        if isinstance(values, Tensor):
+            values = values.contiguous()
+            self._kept.append(values)
+            return values.data_ptr()
+        self._kept.append(values)
+        return ctypes.addressof(values) if isinstance(values, ctypes.Array) else values.ctypes.data
+
+    def _fresh_values(self) -> Iterator[Fresh]:
+        """Yield what placed elements set in each slot that travels with them."""
+        choices = np.array(self.program.task.agent.choices).clip(0)
+        for name, table in self.program.hands.blocks.fresh.items():
+            values = table.cpu()[choices]
+            for piece in self.native.pieces[name]:
+                part = values if piece.component is None else values[:, piece.component]
+                slot, bits, _ = self.native.homes[piece.slot]
+                yield Fresh(slot, bits, self._address(part.long() if bits else part.float()))
+
+    # Episodes
+
+    def bind(self, episodes: Episodes, params: Mapping[str, Tensor], kept: Mapping[str, Tensor]) -> Episodes:
+        """Return the episodes in memory that steps write to from now on.
+
+        `params` are float64 [B] each; `kept` are an environment's tensors by the names of `Play`, [B] each: ``episode``,
+        ``returned``, and ``waiting``, the episodes that are over.
+        """
+        state, world, worlds = episodes.world.state, episodes.world, len(episodes)
+        if not (isinstance(state, PackedState) and state.program is self.native):
+            state = self.native.pack(state)
+        # Copies: `start` and `before`, and numbers of worlds, may be the same tensors.
+        clock = [tensor.clone() for tensor in (world.seed, world.index, world.step)]
+        names = ("seed", "acted", "failed", "start", "before")
+        rows = {name: getattr(episodes, name).clone(memory_format=torch.contiguous_format) for name in names}
+        masks = Masks(episodes.masks.words.clone(), episodes.masks.sizes.clone())
+        own = {name: cells.clone() for name, cells in self._own(episodes.regions).items()}
+        self.episodes = replace(
+            episodes,
+            world=World(self.program.simulator, state, *clock),
+            regions={**episodes.regions, **own},
+            targets={name: target.clone() for name, target in episodes.targets.items()},
+            masks=masks,
+            **rows,
+        )
+        self._has_maps = bool(own or episodes.targets)
+        inputs = self.native.inputs(params, worlds)
+        if self.filled is None or len(self.filled) != worlds:
+            self.filled, self._ahead = torch.zeros(worlds, dtype=torch.int64), None
+        self._now = torch.zeros_like(rows["before"])
+        self.begins = torch.zeros(worlds, dtype=torch.bool)
+        clocks = zip(("seed", "index", "step"), clock, strict=True)
+        rows["world"] = rows.pop("seed")
+        self.numbers = np.empty((worlds, self.play.numbers), np.int64)
+        """The numbers of the next actions."""
+        self._numbers_at = self.numbers.ctypes.data
+        self._results: Results | None = None
+        self._tensors: dict[str, Tensor] = {
+            **dict(clocks),
+            **rows,
+            **kept,
+            "param_planes": inputs.planes,
+            "param_reals": inputs.reals,
+            "now": self._now,
+            "masks": masks.words,
+            "sizes": masks.sizes,
+            "action": torch.zeros(worlds, len(ACTION_NUMBERS), dtype=torch.int64),
+            "begins": self.begins,
+            "filled": self.filled,
+        }
+        for name, tensor in self._tensors.items():
+            setattr(self.play, name, tensor.data_ptr())
+        self.play.batch, self._params = state.handle, params
+        self.play.mask_words, self.play.own_masks = masks.words[0].numel(), self.program.meter.own
+        return self.episodes
+
+    def write_to(self, results: Results) -> None:
+        """Let the next calls write to results."""
+        if results is not self._results:
+            for name, address in results.addresses.items():
+                setattr(self.play, name, address)
+            self._results = results
+
+    def step(self) -> int:
+        """Step with `numbers`. Returns the place of the first number that is out of range, and nothing
+        has changed; or READY or EMPTY.
+        """
+        library, play, address = self.native.library, self._play, self._numbers_at
+        self.episodes.world.state.forget()  # type: ignore[attr-defined]
+        if not self.measures_cells:
+            status = int(library.pd_play(play, address))
+            if status == READY:
+                self._copy_maps()
+            return status
+        status = int(library.pd_act(play, address))
+        if status >= 0:
+            return status
+        if self.play.counted:
+            episodes, meter = self.episodes, self.program.meter
+            places = episodes.regions, episodes.targets, self._params
+            meter.take_cells(episodes.world, *places, self._now, self.counts)
+        if not library.pd_finish(play):
+            return EMPTY
+        self.begin()
+        return READY
+
+    def begin(self) -> None:
+        """Begin the next episodes where `begins` says so, and write observations."""
+        self.episodes.world.state.forget()  # type: ignore[attr-defined]
+        self.native.library.pd_begin(self._play)
+        self._copy_maps()
+
+    def _own(self, regions: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        """Return the regions that each world has of its own."""
+        return {name: cells for name, cells in regions.items() if name not in self.program.fixed}
+
+    def _copy_maps(self) -> None:
+        """Copy the regions and targets of episodes that have begun."""
+        if not self._has_maps or self._ahead is None or not bool(self.begins.any()):
+            return
+        own = self._own(self.episodes.regions)
+        rows = self.begins.nonzero()[:, 0]
+        places = rows * self.play.depth + self._tensors["episode"][rows] % self.play.depth
+        for name, cells in own.items():
+            cells[rows] = self._ahead.regions[name][places]
+        for name, target in self.episodes.targets.items():
+            target[rows] = self._ahead.targets[name][places]
+
+    def fill(self, numbers: Callable[[Tensor, Tensor], Tensor]) -> None:
+        """Make the start worlds of the next episodes; `numbers` gives those of rows and episodes, int64 [n] each."""
+        worlds = len(self.begins)
+        cells = worlds * self.program.task.size[0] * self.program.task.size[1]
+        depth = self.play.depth = min(max(2 if cells < POOL_CELLS else 1, POOL_CELLS // cells), MOST_AHEAD)
+        assert self.filled is not None
+        episode = self._tensors["episode"]
+        first, end = torch.maximum(self.filled, episode + 1), episode + 1 + depth
+        count = end - first
+        rows = torch.arange(worlds).repeat_interleave(count)
+        episodes = torch.arange(len(rows)) - (count.cumsum(0) - count - first)[rows]
+        places = rows * depth + episodes % depth
+        order = places.argsort()
+        fresh = self.program.start(numbers(rows[order], episodes[order]))
+        ahead = (
+            fresh if self._ahead is None else self.program.put(self._ahead, places[order], fresh, reuse=True)
+        )
+        state = ahead.world.state
+        if not isinstance(state, PackedState):
+            state = self.native.pack(state)
+            ahead = replace(ahead, world=ahead.world.with_state(state))
+        self._ahead = ahead
+        self.filled.copy_(end)
+        self.play.pool, self.play.pool_world = state.handle, ahead.seed.data_ptr()
+        self.play.pool_start, self.play.pool_sizes = ahead.start.data_ptr(), ahead.masks.sizes.data_ptr()
+        self.play.pool_masks = ahead.masks.words.data_ptr()
