@@ -27,7 +27,8 @@ from powderdsl.datasets.manifest import (
 )
 from powderdsl.diagnostics import CompileError
 from powderdsl.envs.actions import FrameStack, Policy, random_policy
-from powderdsl.envs.tensor_env import Observation, TensorEnv, observation_of
+from powderdsl.envs.compiled import CompiledEnv
+from powderdsl.envs.tensor_env import Observation, observation_of
 from powderdsl.experiments.runs import differences, lock_folder
 from powderdsl.system.random import action_keys
 from powderdsl.system.settings import check_count
@@ -107,7 +108,7 @@ def record(
     name = policy if isinstance(policy, str) else policy_name
     if not name:
         raise ValueError("a policy that is a function needs a policy_name, by which its data are known")
-    env = TensorEnv(task, 1, observation=observation, autoreset_mode="disabled", **how)
+    env = CompiledEnv(task, 1, observation=observation, autoreset_mode="disabled", **how)
     recipe = recipe_of(env, policy=name, episodes=episodes, seed=seed, compress=compress, shard=shard)
     sight = observation_of(sees or observation, env.simulator, env.task.size)
     act = SCRIPTED[policy](env.program) if isinstance(policy, str) else policy
@@ -201,7 +202,7 @@ class _Recording:
     def played(self, numbers: Array, done: int, progress: Progress) -> list[dict[str, Array]]:
         """The arrays of some episodes, played at once. Those that are over run on, and no longer count."""
         recipe, count = self.recipe, len(numbers)
-        env = TensorEnv(
+        env = CompiledEnv(
             self.program,
             count,
             observation=recipe.observation,

@@ -22,7 +22,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from powderdsl.envs import env_id
-from powderdsl.envs.tensor_env import Info, TensorEnv
+from powderdsl.envs.compiled import CompiledEnv, arrays_of
+from powderdsl.envs.tensor_env import TensorEnv
 from powderdsl.simulation.draw import scale
 from powderdsl.system.settings import check_choice
 from powderdsl.tasks.episodes import TaskProgram
@@ -38,10 +39,6 @@ def array(tensor: Tensor) -> Array:
     return tensor.cpu().numpy()
 
 
-def arrays(info: Info) -> dict[str, Any]:
-    return {name: arrays(value) if isinstance(value, dict) else array(value) for name, value in info.items()}
-
-
 def objects(rows: Array, mask: Array) -> Array:
     """Rows [n, …] as an array of objects [B]: None where `mask` is not set."""
     column = np.full(len(mask), None, dtype=object)
@@ -53,7 +50,7 @@ def objects(rows: Array, mask: Array) -> Array:
 class Face:
     """The base of environments that show a `TensorEnv` to a library: their pictures and their spec."""
 
-    tensors: TensorEnv
+    tensors: CompiledEnv
     """The same environment for tensors."""
     render_mode: str | None
     render_scale: int
@@ -66,7 +63,7 @@ class Face:
         self.render_mode, self.render_scale = rest.pop("render_mode"), rest.pop("render_scale")
         if self.render_mode is not None:
             check_choice("render_mode", self.render_mode, RENDER_MODES)
-        self.tensors = TensorEnv(task, **rest)
+        self.tensors = CompiledEnv(task, **rest)
         self.spec = EnvSpec(
             env_id(self.tensors.task.name),
             entry_point="powderdsl.envs.gym:PowderEnv",
@@ -142,7 +139,7 @@ class PowderVectorEnv(Face, VectorEnv[Any, Any, Any]):
         observed, info = self.tensors.reset(seed=seed, options=options)  # first: a bad seed changes nothing
         if isinstance(seed, int):
             super().reset(seed=seed)
-        return array(observed), arrays(info)
+        return array(observed), arrays_of(info)
 
     def step(self, actions: Any) -> tuple[Array, Array, Array, Array, dict[str, Any]]:
         """Act once in every world: `TensorEnv.step` with arrays.
@@ -151,11 +148,11 @@ class PowderVectorEnv(Face, VectorEnv[Any, Any, Any]):
             Observations [B, …], reward float32 [B], terminated and truncated bool [B], and infos; ``final_obs`` is an
             array of objects [B]: None unless the episode ended.
         """
-        observed, reward, terminated, truncated, info = self.tensors.step(actions)
-        infos = arrays(info)
+        *parts, infos = self.tensors.step_arrays(actions)
         if "final_obs" in infos:
             infos["final_obs"] = objects(infos["final_obs"], infos["_final_obs"])
-        return array(observed), array(reward), array(terminated), array(truncated), infos
+        observed, reward, terminated, truncated = parts
+        return observed, reward, terminated, truncated, infos
 
     def action_masks(self) -> Array:
         """Return the mask of allowed actions: bool [B, n], the values of an action's first number, then of its second, …"""
@@ -203,10 +200,10 @@ class PowderEnv(Face, gymnasium.Env[Array, Any], EzPickle):
             The observation, the reward, terminated, truncated, and infos: ``success``, ``world``, and the
             ``episode_return`` and ``episode_length`` so far.
         """
-        observed, reward, terminated, truncated, info = self.tensors.step(np.asarray(action)[None])
-        return array(observed[0]), float(reward[0]), bool(terminated[0]), bool(truncated[0]), self._info(info)
+        observed, reward, terminated, truncated, info = self.tensors.step_arrays(np.asarray(action)[None])
+        return observed[0], float(reward[0]), bool(terminated[0]), bool(truncated[0]), self._info(info)
 
-    def _info(self, info: Info) -> dict[str, Any]:
+    def _info(self, info: Mapping[str, Any]) -> dict[str, Any]:
         assert self.tensors.episodes is not None
         infos = {
             "success": bool(info["success"][0]),
@@ -214,7 +211,7 @@ class PowderEnv(Face, gymnasium.Env[Array, Any], EzPickle):
             "episode_return": float(self.tensors.returns[0]),
             "episode_length": int(self.tensors.episodes.acted[0]),
         }
-        return infos | ({"action_mask": array(info["action_mask"][0])} if "action_mask" in info else {})
+        return infos | ({"action_mask": np.asarray(info["action_mask"][0])} if "action_mask" in info else {})
 
     def action_masks(self) -> Array:
         """Return the mask of allowed actions: bool [n], the values of an action's first number, then of its second, …"""

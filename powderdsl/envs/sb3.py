@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import VecEnv
 
-from powderdsl.envs.gym import Face, array, arrays
+from powderdsl.envs.gym import Face, array
 from powderdsl.tasks.episodes import TaskProgram
 from powderdsl.tasks.task import Task
 
@@ -55,12 +55,12 @@ class PowderVecEnv(Face, VecEnv):
 
     def step_wait(self) -> tuple[Array, Array, Array, list[dict[str, Any]]]:
         """Observations, rewards float32 [B], whether episodes ended bool [B], and infos."""
-        observed, reward, terminated, truncated, info = self.tensors.step(self._actions)
-        done = array(terminated | truncated)
+        observed, reward, terminated, truncated, info = self.tensors.step_arrays(self._actions)
+        done = terminated | truncated
         infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
         if done.any():
-            final, passed = arrays(info["final_info"]), round(time.time() - self._began, 6)
-            for place, last in zip(np.flatnonzero(done), array(info["final_obs"]), strict=True):
+            final, passed = info["final_info"], round(time.time() - self._began, 6)
+            for place, last in zip(np.flatnonzero(done), info["final_obs"], strict=True):
                 returned, length = float(final["episode_return"][place]), int(final["episode_length"][place])
                 infos[place] = {
                     "terminal_observation": last,
@@ -69,7 +69,7 @@ class PowderVecEnv(Face, VecEnv):
                 }
                 if self.tensors.task.goal.success is not None:
                     infos[place]["is_success"] = bool(final["success"][place])
-        return array(observed), array(reward), done, infos
+        return observed, reward, done, infos
 
     def action_masks(self) -> Array:
         """Return the mask of allowed actions, for `MaskablePPO`: bool [B, n]."""
