@@ -14,10 +14,11 @@ from powderdsl.system.packages import importing
 from powderdsl.tasks.shipped import shipped_tasks
 
 if TYPE_CHECKING:
+    from powderdsl.envs.compiled import CompiledEnv
     from powderdsl.envs.gym import GoalEnv, PowderEnv, PowderVectorEnv
     from powderdsl.envs.tensor_env import TensorEnv
 
-__all__ = ["GoalEnv", "PowderEnv", "PowderVectorEnv", "TensorEnv"]
+__all__ = ["CompiledEnv", "GoalEnv", "PowderEnv", "PowderVectorEnv", "TensorEnv"]
 
 
 def env_id(task: str) -> str:
@@ -38,5 +39,6 @@ for _task in shipped_tasks():
 
 
 __getattr__, __dir__ = importing(
-    "powderdsl.envs", {"gym": "GoalEnv PowderEnv PowderVectorEnv", "tensor_env": "TensorEnv"}
+    "powderdsl.envs",
+    {"gym": "GoalEnv PowderEnv PowderVectorEnv", "compiled": "CompiledEnv", "tensor_env": "TensorEnv"},
 )

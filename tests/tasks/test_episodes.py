@@ -223,7 +223,7 @@ def test_the_last_action_is_over_and_free_steps_run_in_it(torch, program_of):
     assert not success.any()
     assert episodes.acted.tolist() == [2, 3, 2, 3]
     assert episodes.world.step.tolist() == [4, 11, 4, 11]
-    done, _ = program._hands.act(before.world, actions, reuse=False)
+    done, _ = program.hands.act(before.world, actions, reuse=False)
     short, long = program.simulator.step(done, 2), program.simulator.step(done, 7)
     for name, value in episodes.world.state.items():
         for world in range(4):

@@ -84,7 +84,7 @@ def test_channels_are_what_the_simulator_does(task: str, folder: Path) -> None:
     more = torch.arange(len(xy))
     actions = torch.cat([xy, torch.stack([more % choices, more % 3, more // 3 % 3], 1)], 1)
     start = program.start(torch.zeros(len(actions), dtype=torch.int64)).world
-    after, done = program._hands.act(start, actions, reuse=False)
+    after, done = program.hands.act(start, actions, reuse=False)
     placed, rows_of_speed, columns_of_speed = recording.painted(actions).unbind(1)
     assert torch.equal(torch.where(placed != NO_ELEMENT, placed, start.ids), after.ids)
     assert torch.equal((placed != NO_ELEMENT).flatten(1).any(1), done["placed"].bool())
