@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Container, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, partial
+from itertools import chain
 
 from powderdsl.compiler import lower
 from powderdsl.ir.bits import lower_pass
@@ -24,7 +25,6 @@ from powderdsl.prover.symbolic import (
     Names,
     Ranges,
     Reset,
-    SubstepEvaluation,
     Symbols,
     Turned,
     Undecided,
@@ -107,16 +107,16 @@ class Moment:
 
 
 def growing_ranges(program: Program) -> list[Ranges]:
-    """Before each pass: the ranges of the slots that start each step at their defaults."""
+    """Before each pass and after the last: the ranges of the slots that start each step at their defaults."""
     ranges = {
         s.name: (int(s.default), int(s.default)) for s in program.slots if s.resets and s.type.name == "int"
     }
-    before: list[Ranges] = []
+    before: list[Ranges] = [dict(ranges)]
     for pass_ in program.passes:
-        before.append(dict(ranges))
-        for name, node in pass_.outputs:
+        for name, node in chain(pass_.outputs, *(step.writes for step in pass_.substeps)):
             if name in ranges:
                 ranges[name] = (min(ranges[name][0], node.type.lo), max(ranges[name][1], node.type.hi))
+        before.append(dict(ranges))
     return before
 
 
@@ -131,7 +131,7 @@ class Prover:
         self.program = lower(ruleset)
         self.planes = [lower_pass(self.program, pass_) for pass_ in self.program.passes]
         self.ranges = growing_ranges(self.program)
-        self._substeps: dict[tuple[int, bool], list[Moment]] = {}
+        self._moments: dict[tuple[int, bool], list[Moment]] = {}
         self._laws: dict[frozenset[int], Law] = {}
         self._failures: list[int] = []
         """Passes in which sums could not be proven."""
@@ -145,62 +145,69 @@ class Prover:
         before = Before(symbols := self._symbols())
         return Moment("start", symbols, (before,), before, Reset(before, symbols))
 
-    @cached_property
-    def whole(self) -> dict[int, Moment]:
-        """The passes by number. Those that have turned out too large are taken out."""
-        moments = {}
-        for number, pass_ in enumerate(self.planes):
-            evaluation = Evaluation(before := Before(symbols := self._symbols(MAX_WHOLE)), symbols)
-            after = evaluation.after(pass_.outputs)
-            moments[number] = Moment(pass_.name, symbols, (before,), before, after, self.ranges[number])
-        return moments
-
-    def broken_by(self, check: Callable[[Moment], bool]) -> Moment | None:
-        """The first moment of a step that fails a check: passes as a whole, or their substeps where they are too large."""
+    def broken_by(self, check: Callable[[Moment], bool], *, everywhere: bool = False) -> Moment | None:
+        """The first moment of a step that fails a check. Unless it must hold `everywhere`, a pass as a whole may pass it."""
         if not check(self.start):
             return self.start
-        for number in range(len(self.planes)):
-            if number in self.whole:
-                try:
-                    if check(self.whole[number]):
-                        continue
-                    return self.whole[number]
-                except (Undecided, OutOfWork):
-                    if len(self.planes[number].substeps) == 1:
-                        raise
-                    del self.whole[number]
-            for moment in self.substeps(number, cut=True):
-                if not check(moment):
-                    return moment
+        for number, pass_ in enumerate(self.planes):
+            places = range(len(pass_.substeps))
+            failed = next((m for place in places if (m := self._failed(number, place, check))), None)
+            if failed is None:
+                continue
+            whole = failed if everywhere or len(places) == 1 else self.moments(number, cut=False)[-1]
+            try:
+                if whole is failed or not check(whole):
+                    return whole
+            except (Undecided, OutOfWork):
+                return failed
         return None
 
-    def substeps(self, number: int, *, cut: bool) -> list[Moment]:
-        """The substeps of a pass. `cut`: each begins with any well-formed world, otherwise with what those before it leave."""
-        if (number, cut) not in self._substeps:
-            self._substeps[number, cut] = self._make_substeps(number, cut)
-        return self._substeps[number, cut]
+    def _failed(self, number: int, place: int, check: Callable[[Moment], bool]) -> Moment | None:
+        """None if a substep passes a check: from any well-formed world, or from what the substeps before it leave."""
+        failed = None
+        for cut in (True, False) if place else (False,):
+            moment = self.moments(number, cut=cut)[place]
+            try:
+                if check(moment):
+                    return None
+                failed = moment
+            except (Undecided, OutOfWork):
+                if failed is None:
+                    raise
+        return failed
 
-    def _make_substeps(self, number: int, cut: bool) -> list[Moment]:
+    def moments(self, number: int, *, cut: bool) -> list[Moment]:
+        """The substeps of a pass, from any well-formed world if `cut`; otherwise from what those before it leave, and then the
+        pass as a whole."""
+        if (number, cut) not in self._moments:
+            self._moments[number, cut] = self._make_moments(number, cut)
+        return self._moments[number, cut]
+
+    def _make_moments(self, number: int, cut: bool) -> list[Moment]:
         moments = []
-        pass_, ranges = self.planes[number], self.ranges[number]
+        pass_, ranges = self.planes[number], self.ranges[number + cut]
         state: dict[str, Node] = {}
+        known: dict[Node, tuple[str, str]] = {}
         row = self.start.symbols.layouts["element"]
-        shared = Evaluation(Before(symbols := self._symbols()), symbols)
+        evaluation = Evaluation(begin := Before(symbols := self._symbols(MAX_WHOLE)), symbols)
         for place, substep in enumerate(pass_.substeps):
             elements = [(plane, node) for plane, node in substep.writes if plane in row.planes]
-            moves = tuple(_moves(elements, state.values()))
-            name = f"{pass_.name}.{place}"
+            moves = tuple(_moves(elements, known))
             if cut:
-                begin = Before(symbols := self._symbols())
-                single = SubstepEvaluation(begin, Before(symbols, "now"), pass_, place, symbols)
-                starts = (begin, single.start)
-                moments.append(Moment(name, symbols, starts, single.start, single.end, ranges, single, moves))
-            else:
-                before = shared.after(state.items())
-                after = shared.after((state | dict(substep.writes)).items())
-                moments.append(Moment(name, symbols, (shared.before,), before, after, ranges, shared, moves))
+                begin = Before(symbols := self._symbols(MAX_WHOLE))
+                evaluation = Evaluation(begin, symbols, cut=dict(known))
+            before = evaluation.after(state.items())
             state |= dict(substep.writes)
-        return moments
+            ends = pass_.outputs if place == len(pass_.substeps) - 1 else ()
+            after = evaluation.after([*state.items(), *ends])
+            starts = (begin, before) if cut else (begin,)
+            name = f"{pass_.name}.{place}" if len(pass_.substeps) > 1 else pass_.name
+            moments.append(Moment(name, symbols, starts, before, after, ranges, evaluation, moves))
+            for plane, node in substep.writes:
+                if node.op not in ("input", "const"):
+                    known.setdefault(node, (f"{place}", plane))
+        whole = Moment(pass_.name, symbols, (begin,), begin, moments[-1].after, ranges)
+        return moments if cut else [*moments, whole]
 
     def broken(self, claim: Claim, without: frozenset[int] = frozenset()) -> Moment | None:
         """Return None if the claim is proven for worlds that start without some elements; else a moment that may break it, whose
@@ -265,17 +272,11 @@ class Prover:
             net = moment.symbols.net
             return net.all(net.member(row.bits(world, *cell), allowed[row.slot.name]) for row in rows)
 
-        def add(moment: Moment) -> bool:
-            """Return True if the moment adds nothing; otherwise what it adds is allowed from now on."""
-            if moment.keeps(law):
-                return True
+        # What a moment adds is allowed from now on.
+        while moment := self.broken_by(lambda moment: moment.keeps(law), everywhere=True):
             for row in rows:
                 bits = map(moment.questions.holds, row.bits(moment.after, *HERE))
                 allowed[row.slot.name].add(sum(bit << i for i, bit in enumerate(bits)))
-            return False
-
-        while self.broken_by(add) is not None:
-            pass
         return law
 
     def _never_for(self, claim: Never, given: Sequence[Law]) -> Moment | None:
@@ -300,10 +301,11 @@ class Prover:
         """The first pass or substep that may leave a cell that is not well-formed; None if all keep them."""
 
         def keeps(moment: Moment) -> bool:
-            facts = moment.symbols.well_formed(moment.after, HERE)
+            after, before = (moment.symbols.well_formed(w, HERE) for w in (moment.after, moment.before))
+            facts = (fact for fact, same in zip(after, before, strict=True) if fact != same)
             return not moment.can_be([moment.symbols.net.all(facts) ^ 1])
 
-        return self.broken_by(keeps)
+        return self.broken_by(keeps, everywhere=True)
 
     def _unchanging(self, ids: frozenset[int], given: Sequence[Law], moment: Moment) -> bool:
         net, row = moment.symbols.net, moment.symbols.layouts["element"]
@@ -317,18 +319,11 @@ class Prover:
         changing = [
             i for i, s in enumerate(self.planes[number].substeps) if any(p in planes for p, _ in s.writes)
         ]
-        cuts = [False, True] if number not in self.whole else [False]
-        for cut in cuts:
-            try:
-                moments = self.substeps(number, cut=cut)
-                for i in changing:
-                    if not self._only_moves(moments[i]) and not self._matched(moments[i], ids, trend, given):
-                        return moments[i]
-                return None
-            except (Undecided, OutOfWork):
-                if cut is cuts[-1]:
-                    raise
-        return None
+
+        def keeps(moment: Moment) -> bool:
+            return self._only_moves(moment) or self._matched(moment, ids, trend, given)
+
+        return next((moment for i in changing if (moment := self._failed(number, i, keeps))), None)
 
     def _only_moves(self, moment: Moment) -> bool:
         """Return whether a substep only exchanges elements between cells: then it changes no number at all."""
@@ -429,9 +424,8 @@ def _reads_clock(pass_: PassGraph) -> bool:
     return any(node.op == "coordinate" and node.attr[0] == "step" for node in nodes_of(pass_))
 
 
-def _moves(writes: Iterable[tuple[str, Node]], known: Iterable[Node]) -> Iterator[tuple[Node, Offset]]:
-    """The movers of a substep, and where they move; `known` nodes are from before."""
-    cut = set(known)
+def _moves(writes: Iterable[tuple[str, Node]], cut: Container[Node]) -> Iterator[tuple[Node, Offset]]:
+    """The movers of a substep, and where they move; `cut` are nodes of substeps before."""
 
     def contents(node: Node) -> tuple[Node, ...]:
         if node in cut:

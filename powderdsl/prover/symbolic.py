@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 from typing import Any, Protocol
 
 from powderdsl.ir.lower import draws_below
-from powderdsl.ir.ops import OPS, REAL, Node, Offset, PassGraph, Program, Threshold, integer, plane_name
+from powderdsl.ir.ops import OPS, REAL, Node, Offset, Program, Threshold, integer, plane_name
 from powderdsl.model.state import Slot, fresh_values, slots
 from powderdsl.model.types import Ruleset
 from powderdsl.prover.net import FALSE, TRUE, Literal, Net
@@ -284,9 +284,8 @@ class Symbols:
         """Return what every cell fulfills, as far as it concerns these planes: known elements, numbers in their ranges, and
         usual values in cells of elements that hold no others. `ranges` are narrower ones."""
         net, element = self.net, self.layouts["element"]
-        owners = (
-            self.layouts.values() if planes is None else dict.fromkeys(map(self._owners.__getitem__, planes))
-        )
+        owned = self._owners if planes is None else filter(self._owners.__contains__, planes)
+        owners = dict.fromkeys(map(self._owners.__getitem__, owned))
         ids = element.bits(world, *cell)
         facts = [net.member(ids, self.ids)]
         for row in owners:
@@ -410,10 +409,16 @@ class Names:
 
 
 class Evaluation:
-    """Nodes as formulas over a world before."""
+    """Nodes as formulas over a world before. Nodes of `cut` may have any value, in the plane of the world that it names."""
 
-    def __init__(self, before: World, symbols: Symbols, names: Names | None = None) -> None:
-        self.before, self.symbols, self.names = before, symbols, names or Names()
+    def __init__(
+        self,
+        before: World,
+        symbols: Symbols,
+        names: Names | None = None,
+        cut: Mapping[Node, tuple[str, str]] | None = None,
+    ) -> None:
+        self.before, self.symbols, self.names, self.cut = before, symbols, names or Names(), cut or {}
         self._values: dict[tuple[Node, int, int], int] = {}
 
     def after(self, writes: Iterable[tuple[str, Node]]) -> Written:
@@ -450,6 +455,10 @@ class Evaluation:
     def _compute(self, node: Node, y: int, x: int) -> int:
         symbols, net, terms, value = self.symbols, self.symbols.net, self.symbols.terms, self.value
         args, attr, is_real = node.args, node.attr, node.type == REAL
+        if node in self.cut:
+            tag, plane = self.cut[node]
+            world = Before(symbols, tag)
+            return world.real(plane, y, x) if is_real else world.bit(plane, y, x)
         match node.op:
             case "input":
                 return self.before.real(attr, y, x) if is_real else self.before.bit(attr, y, x)
@@ -509,30 +518,6 @@ class Evaluation:
                     return symbols.compare(node.op, a, b)
                 return {"eq": net.xor(a, b) ^ 1, "lt": net.and_(a ^ 1, b), "le": net.or_(a ^ 1, b)}[node.op]
         return terms.apply(node.op, attr, [value(arg, y, x) for arg in args])
-
-
-class SubstepEvaluation(Evaluation):
-    """One substep of a pass, from any world that the substeps before may have left."""
-
-    def __init__(self, start: World, now: World, pass_: PassGraph, number: int, symbols: Symbols) -> None:
-        super().__init__(start, symbols)
-        state: dict[str, Node] = {}
-        for substep in pass_.substeps[:number]:
-            state |= dict(substep.writes)
-        self.now = now
-        self._cut = {node: plane for plane, node in state.items() if node.op not in ("input", "const")}
-        self.start = self.after(state.items())
-        """The world before the substep. Planes that no substep wrote are still those of the pass's start."""
-        writes = state | dict(pass_.substeps[number].writes)
-        if number == len(pass_.substeps) - 1:  # floats settle at the end
-            writes |= {plane: node for plane, node in pass_.outputs if node.op != "settle"}
-        self.end = self.after(writes.items())
-
-    def value(self, node: Node, y: int, x: int) -> int:
-        plane = self._cut.get(node)
-        if plane is None:
-            return super().value(node, y, x)
-        return self.now.real(plane, y, x) if node.type == REAL else self.now.bit(plane, y, x)
 
 
 @contextmanager
