@@ -38,7 +38,7 @@ WIDTHS = (7, 31, 32, 33, 63, 64, 64, 64, 65, 97, 128, 130)
 """Columns of wide worlds: the borders of words of 32 and 64 columns, more words than one, and the width of most worlds."""
 
 STRIPS = 8
-"""The most strips that native code cuts a world into; it does so if they have equally many rows."""
+"""Strips that native code cuts a world into, unless its words are narrow; it does so if they have equally many rows."""
 
 MANY = 9
 """More worlds than native code runs side by side; one seed in eight has so many."""

@@ -14,7 +14,7 @@ from powderdsl.targets.printing import CellValues
 AT_ONCE = 4
 """Choices that are skipped together: a branch for each choice would be hard to predict."""
 
-PLACE = "const int lane = strips ? y / height : l, row = strips ? y - lane * height : y; (void)lane; (void)row;"  # fmt: skip
+PLACE = "const int lane = strips > 1 ? l + y / height : l, row = y - (lane - l) * height; (void)lane; (void)row;"  # fmt: skip
 """The lane and the row of planes that contain the words of row y."""
 
 _FLOATS = {

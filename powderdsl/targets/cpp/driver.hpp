@@ -10,35 +10,44 @@ struct Batch {
   Grid g;
   int worlds;
   std::vector<Group> groups;
-  int lanes() const { return g.strips ? worlds * LANES : worlds; }  // what lies side by side, in all groups
+  int lanes() const { return worlds * g.strips; }  // what lies side by side, in all groups
   // Where a lane's cells begin in arrays of worlds; `apart`: from one world to the next, `row`: from row to row.
   int64_t at(int lane, int64_t apart, int64_t row) const {
-    return g.strips ? lane / LANES * apart + lane % LANES * g.height * row : lane * apart;
+    return lane / g.strips * apart + lane % g.strips * g.height * row;
   }
 };
 
 constexpr size_t LARGE_PLANE = 32 << 10;  // bytes from which a plane of LANES worlds is too large to be kept near
-constexpr int GROUP_WORK = 8;  // what a step of a group costs beside its words, in words
-// Strips waste no lanes where there are few worlds, and keep less at hand where worlds are large.
+constexpr int GROUP_WORK = 8;             // what a step of a group costs beside that of its words, in words
+// Strips fill lanes where there are few worlds, and keep less at hand where worlds are large.
 static Grid make_grid(int worlds, int height, int width) {
-  const int words = (width + BITS - 1) / BITS;
+  const int words = (width + BITS - 1) / BITS, least_rows = std::max({1, AROUND_ROWS, BEYOND_ROWS});  // only the next strip is asked
   const bool large = sizeof(V) * height * words >= LARGE_PLANE;
-  const bool reachable = height / LANES >= std::max({1, AROUND_ROWS, BEYOND_ROWS});  // only the next strip is asked
-  const int work = height * words + GROUP_WORK, strip_work = height / LANES * words + GROUP_WORK;
-  const bool strips = height % LANES == 0 && reachable && (large || (worlds <= LANES && worlds * strip_work < work));
   Grid g;
-  g.height = strips ? height / LANES : height, g.strips = strips;
+  int64_t least = INT64_MAX;
+  for (int strips = 1; strips <= LANES && height % strips == 0 && (strips == 1 || height / strips >= least_rows); strips *= 2) {
+    const int64_t groups = ((int64_t)worlds * strips + LANES - 1) / LANES, work = groups * (height / strips * words + GROUP_WORK);
+    if (work < least || large) least = work, g.strips = strips;
+  }
+  g.height = height / g.strips;
 #if !WIDTH
   g.width = width, g.words = words, g.stride = stride_of(width);
 #endif
   return g;
 }
 static bool fixed_flag(const FixedPlane& f, const Grid& g, int lane, int y, int x) {
-  if (g.strips) y += lane * g.height;
+  y += lane % g.strips * g.height;
   switch (f.kind) {
     case 0: return (y % f.a) >> f.b & 1;
     case 1: return (x % f.a) >> f.b & 1;
     default: return y + f.a >= 0 && y + f.a < g.world_height() && x + f.b >= 0 && x + f.b < g.width;
+  }
+}
+// A number for each hash of a vector of words, from its lane.
+template <class Of> ALWAYS void by_hash(U* parts, Of of) {
+  for (int l = 0; l < LANES; l++) {
+    const u32 number = of(l);
+    for (int i = 0; i < HASHES; i++) parts[l % PARTS][l / PARTS * HASHES + i] = number;
   }
 }
 static Context* new_context(const Grid& g) {
@@ -52,7 +61,7 @@ static Context* new_context(const Grid& g) {
   const int whole = g.world_height();
   for (int y = -HALO; y < whole + HALO; y++) c->lines.push_back(((y % whole) + whole) % whole);
   for (int y = -HALO; y < g.height + HALO; y++) {
-    if (!g.strips) c->wrapped.push_back(c->lines[y + HALO] * g.words);
+    if (g.strips == 1) c->wrapped.push_back(c->lines[y + HALO] * g.words);
     else c->wrapped.push_back(y < 0 ? g.above(y) : y < g.height ? y * g.words : g.below(y));
   }
   c->nothing = new Plane{aligned<V>(g.cells() + g.halos()), 1, true, 0, 0};
@@ -64,6 +73,8 @@ static Context* new_context(const Grid& g) {
   c->late = aligned<V>((MOVING + 1) * g.words);
   c->entered = aligned<V>(g.height + 1);
   c->moving = aligned<int>(g.height + 1);
+  const u32 across = (g.width + 31) / 32;
+  by_hash(c->strip_starts, [&](int l) { return l % g.strips * g.height * across * 32 * APART; });
   c->zeros = aligned<float>(g.stride + HALO + CHUNK);
   c->turned = aligned<Word>((size_t)LANES * g.height * g.words * TURNED);
   c->marks = aligned<u32>((size_t)(MARKS + 1) * g.height);
@@ -143,16 +154,16 @@ struct Clocks {
   u64 since;  // steps after `step`
 };
 static int world_of(const Context& c, int number, int lane) {  // unused lanes are the last world once more
-  return c.g.strips ? number : number * LANES + std::min(lane, c.lanes - 1);
+  return (number * LANES + std::min(lane, c.lanes - 1)) / c.g.strips;
 }
 static void begin_step(Context& c, const Clocks& k, int number, long done) {
-  const u32 strip = c.g.strips ? (u32)c.g.height * ((c.g.width + 31) / 32) * 32 : 0;  // hashes from one strip to the next
-  for (int l = 0; l < LANES; l++) {
-    const u32 step = (u32)(k.step[world_of(c, number, l)] + done);
-    const u32 first = mix(c.world_keys[0][l] + step), second = mix(c.world_keys[1][l] + step);
+  U step[PARTS];
+  by_hash(step, [&](int l) { return (u32)(k.step[world_of(c, number, l)] + done); });
+  for (int i = 0; i < PARTS; i++) {
+    const U first = mix(c.world_keys[0][i] + step[i]), second = mix(c.world_keys[1][i] + step[i]);
     for (int s = 0; s < STREAMS; s++) {
-      const u32 a = mix(first + STREAM_IDENT[s]), b = mix(second + STREAM_IDENT[s]);
-      for (int h = 0, i = l % PARTS, at = l / PARTS * HASHES; h < HASHES; h++, at++) c.k0[s][i][at] = a + l * strip * APART, c.k1[s][i][at] = b;
+      c.k0[s][i] = mix(first + splatu(STREAM_IDENT[s])) + c.strip_starts[i];
+      c.k1[s][i] = mix(second + splatu(STREAM_IDENT[s]));
     }
   }
   std::fill_n(c.tossed, COINS, false);
@@ -186,21 +197,16 @@ static void look(Context& c) {
 }
 static void run_group(Context& c, Batch& b, int number, long steps, const Clocks& k, const uint8_t* planes, const float* reals) {
   c.lanes = std::min(LANES, b.lanes() - number * LANES);
-  for (int l = 0; l < (c.g.strips ? 1 : LANES); l++) {
-    int world = world_of(c, number, l);
-    for (int i = 0; i < PARAM_PLANES; i++) {
-      const Word bits = planes[(size_t)i * b.worlds + world] ? FULL : 0;
-      if (c.g.strips) c.param_bits[i] = splat(bits);
-      else c.param_bits[i][l] = bits;
-    }
-    for (int i = 0; i < PARAM_REALS; i++)
-      for (int to = l; to < (c.g.strips ? LANES : l + 1); to++) c.param_real[i][to] = reals[(size_t)i * b.worlds + world];
-  }
   for (int l = 0; l < LANES; l++) {
     const int world = world_of(c, number, l);
-    c.world_keys[0][l] = world_key(k.seed[world], k.index[world], 0x243F6A88u);
-    c.world_keys[1][l] = world_key(k.seed[world], k.index[world], 0x85A308D3u);
+    for (int i = 0; i < PARAM_PLANES; i++) c.param_bits[i][l] = planes[(size_t)i * b.worlds + world] ? FULL : 0;
+    for (int i = 0; i < PARAM_REALS; i++) c.param_real[i][l] = reals[(size_t)i * b.worlds + world];
   }
+  for (int i = 0; i < 2; i++)
+    by_hash(c.world_keys[i], [&](int l) {
+      const int world = world_of(c, number, l);
+      return world_key(k.seed[world], k.index[world], i ? 0x85A308D3u : 0x243F6A88u);
+    });
   Group& group = b.groups[number];
   for (int i = 0; i < SLOTS; i++) {
     c.slot[i] = group.slot[i];
@@ -392,8 +398,8 @@ API void pd_load(void* batch, int slot, int bits, int item, const void* data, in
 // Some worlds of a batch anew, from arrays of these worlds alone: the lanes of world places[k] from the k-th world.
 template <class Visit> static void in_places(Batch& b, int count, const int64_t* places, Visit visit) {
   for (int k = 0; k < count; k++)
-    for (int strip = 0; strip < (b.g.strips ? LANES : 1); strip++) {
-      const int lane = b.g.strips ? (int)places[k] * LANES + strip : (int)places[k];
+    for (int strip = 0; strip < b.g.strips; strip++) {
+      const int lane = (int)places[k] * b.g.strips + strip;
       visit(b.groups[lane / LANES], lane % LANES, ((int64_t)k * b.g.world_height() + strip * b.g.height) * b.g.width);
     }
 }
@@ -444,10 +450,10 @@ API void pd_put(void* batch, int slot, int bits, int item, const void* data, int
 // last; empty where nothing changes. Visits the rows of each lane that lie in it.
 template <class Visit> static void in_boxes(Batch& b, const int64_t* boxes, Visit visit) {
   for (int lane = 0; lane < b.lanes(); lane++) {
-    const int64_t* box = boxes + 4 * (b.g.strips ? lane / LANES : lane);
-    const int64_t top = b.g.strips ? lane % LANES * b.g.height : 0;
+    const int world = lane / b.g.strips;
+    const int64_t *box = boxes + 4 * world, top = lane % b.g.strips * b.g.height;
     const int first = (int)std::max<int64_t>(box[0] - top, 0), last = (int)std::min<int64_t>(box[1] - top, b.g.height);
-    if (first < last && box[2] < box[3]) visit(b.groups[lane / LANES], lane % LANES, b.g.strips ? lane / LANES : lane, first, last, box);
+    if (first < last && box[2] < box[3]) visit(b.groups[lane / LANES], lane % LANES, world, first, last, box);
   }
 }
 static void fill_values(Batch& b, int slot, int bits, const int64_t* boxes, const int64_t* values) {

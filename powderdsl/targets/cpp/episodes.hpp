@@ -6,7 +6,8 @@ struct Line {
   int group, lane, row;
 };
 static Line line_of(const Batch& b, int world, int y) {
-  return b.g.strips ? Line{world, y / b.g.height, y % b.g.height} : Line{world / LANES, world % LANES, y};
+  const int lane = world * b.g.strips + y / b.g.height;
+  return Line{lane / LANES, lane % LANES, y % b.g.height};
 }
 static void copy_world(Batch& to, int at, const Batch& from, int source) {
   const int rows = to.g.world_height(), words = to.g.words;

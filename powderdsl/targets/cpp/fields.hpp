@@ -52,17 +52,6 @@ static void close_plane(const Context& c, Plane* p) {  // nothing beyond the wid
   p->zero = !any(some);
 }
 // Masks of choices, lane by lane: [LANES][height][words][c.masks], so that a lane finds the words of all masks side by side.
-#if VECTOR == 64
-ALWAYS V two_of(V a, V which, V b) {  // words of a, then of b, by their numbers
-#if WIDTH == 16
-  return (V)_mm512_permutex2var_epi16((__m512i)a, (__m512i)which, (__m512i)b);
-#elif WIDTH == 32
-  return (V)_mm512_permutex2var_epi32((__m512i)a, (__m512i)which, (__m512i)b);
-#else
-  return (V)_mm512_permutex2var_epi64((__m512i)a, (__m512i)which, (__m512i)b);
-#endif
-}
-#endif
 ALWAYS void turn(const V* in, V* out) {  // TURN vectors; squares of as many words
 #if VECTOR == 64
   V number;
@@ -118,10 +107,10 @@ ALWAYS u64 which_turned(const Word* masks, int count) {
 }
 // The chunks of word w, whose values wait in registers.
 #define EACH_REGISTER _Pragma("GCC unroll 16") for (int k = 0, x = BITS * w; k < BITS / CHUNK && (WIDTH || x < width); k++, x += CHUNK)
-// The worlds of a group: `rows` of them from line `base` on. Strips are one world. A row that is not there is `nothing`.
+// The worlds of a group: the first lane, and `rows` of them from line `base` on. A row that is not there is `nothing`.
 #define EACH_WORLD \
   if (const int rows = c.g.world_height(); true) \
-    for (int l = 0; l < (strips ? 1 : c.lanes); l++) \
+    for (int l = 0; l < c.lanes; l += strips) \
       if (const float* const nothing = c.zeros + HALO; true) \
         if (const int *const lines = c.lines.data() + HALO, base = l * height; true)
 // Chunks of the columns in word w, and which of a chunk's columns lie in the grid.
@@ -208,7 +197,7 @@ template <int COUNT> OUTLINE void swap_fields(Context& c, const Plane* movers, i
     for (u32 lanes = lanes_of(some); lanes; lanes &= lanes - 1) {
       const int l = __builtin_ctz(lanes);
       if (l >= c.lanes) break;
-      const int line = l * height + y, base = c.g.strips ? 0 : l * height, there = base + lines[line - base + dy];
+      const int line = l * height + y, base = (l - l % c.g.strips) * height, there = base + lines[line - base + dy];
       float *from[COUNT], *to[COUNT];
       bool edge = false;  // whether the halos change
       int n = 0;

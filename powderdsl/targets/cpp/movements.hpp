@@ -77,7 +77,7 @@ enum Leaves { NOTHING, EVERYTHING, SAME };  // what movers leave behind
 // in a register, and a few planes go together, since each waits for what it reads.
 constexpr int TOGETHER = 4;
 #define EACH_PLANE _Pragma("GCC unroll 4") for (int k = 0; k < N; k++)
-ALWAYS bool near_rows(const Context& c, int dy) { return c.g.words == 1 && !c.g.strips && abs(dy) <= 1; }
+ALWAYS bool near_rows(const Context& c, int dy) { return c.g.words == 1 && c.g.strips == 1 && abs(dy) <= 1; }
 // `by` columns to the left on the torus.
 template <bool TURNS> ALWAYS V around(const Context& c, V x, int by) {
   return TURNS ? around(c, x, by) : x;
@@ -159,10 +159,10 @@ OUTLINE void swap_strips(Context& c, const V* m, V* const* data, int n, int here
   V* seen = c.change + words;
   for (int k = 0; k < n; k++) {
     V *here = data[k] + here_row * words, *there = data[k] + there_row * words;
-    for (int w = 0; w < words; w++) seen[w] = turned(there[w], by);
+    for (int w = 0; w < words; w++) seen[w] = turned(c, there[w], by);
     for (int w = 0; w < words; w++) c.change[w] = (here[w] ^ (dx ? columns(c, seen, w, dx) : seen[w])) & m[w];
     for (int w = 0; w < words; w++) here[w] ^= c.change[w];
-    for (int w = 0; w < words; w++) there[w] ^= turned(dx ? columns(c, c.change, w, -dx) : c.change[w], -by);
+    for (int w = 0; w < words; w++) there[w] ^= turned(c, dx ? columns(c, c.change, w, -dx) : c.change[w], -by);
   }
 }
 // A word's columns, moved by dx: those that stay in the word, and those that come into the next.
@@ -206,7 +206,7 @@ OUTLINE void swap_planes(Context& c, const Plane* movers, int dy, int dx, Plane*
   }
   for (int y = 0; y < c.g.height; y++) {
     const V* m = movers->data + y * words;
-    if (c.g.strips && (u32)(y + dy) >= (u32)c.g.height) {
+    if (c.g.strips > 1 && (u32)(y + dy) >= (u32)c.g.height) {
       const int by = strips_on(c, y + dy);
       if (any_word(m, words)) swap_strips(c, m, data, n, y, y + dy - by * c.g.height, by, dx);
       continue;
@@ -321,11 +321,11 @@ template <Leaves LEAVES> OUTLINE void arrive_planes(Context& c, const Plane* mov
   const int edge = dy > 0 ? height - 1 : 0;
   const V* m = movers->data + edge * words;
   if (!dy || !any_word(m, words)) return;
-  const int lanes_back = c.g.strips ? -dy : 0;
-  for (int w = 0; w < words; w++) targets[w] = turned(dx ? columns(c, m, w, -dx) : m[w], lanes_back);
+  const int lanes_back = c.g.strips > 1 ? -dy : 0;
+  for (int w = 0; w < words; w++) targets[w] = turned(c, dx ? columns(c, m, w, -dx) : m[w], lanes_back);
   for (int k = 0; k < n; k++) {
     V* there = data[k] + (dy > 0 ? 0 : height - 1) * words;
-    for (int w = 0; w < words; w++) there[w] = (there[w] & ~targets[w]) | turned(c.late[k * words + w], lanes_back);
+    for (int w = 0; w < words; w++) there[w] = (there[w] & ~targets[w]) | turned(c, c.late[k * words + w], lanes_back);
   }
 }
 OUTLINE Plane* cleared(Context& c, Plane* old, const Plane* where) {  // old and not where

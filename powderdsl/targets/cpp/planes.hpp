@@ -37,24 +37,20 @@ ALWAYS V columns_zero(const Context& c, const V* row, int w, int dx) {
 }
 ALWAYS const V* row_or_nothing(const Context& c, const Plane* p, int y) {
   if (__builtin_expect(y >= 0 && y < c.g.height, 1)) return p->data + y * c.g.words;
-  if (!c.g.strips) return c.nothing_row;
+  if (c.g.strips == 1) return c.nothing_row;
   return p->data + 2 * AROUND_ROWS * c.g.words + (y < 0 ? c.g.above(y) : c.g.below(y) + (BEYOND_ROWS - AROUND_ROWS) * c.g.words);
 }
 
-// Strips. What each lane sees `by` lanes on, around.
-ALWAYS V turned(V v, int by) {
-#if VECTOR == 64 && WIDTH == 16
+// Strips. What each lane sees `by` lanes on, around those of its world.
+ALWAYS V turned(const Context& c, V v, int by) {
+  const int others = c.g.strips - 1;
+#if VECTOR == 64
   V number;
   for (int l = 0; l < LANES; l++) number[l] = l;
-  return (V)_mm512_permutexvar_epi16((__m512i)(number + splat(by)), (__m512i)v);  // by its low bits
-#elif VECTOR == 64 && WIDTH == 32
-  const U number = NUMBERS;
-  return (V)_mm512_permutexvar_epi32((__m512i)(number + splatu(by)), (__m512i)v);  // by its low bits
-#elif VECTOR == 64
-  return (V)_mm512_permutexvar_epi64((__m512i)(V{0, 1, 2, 3, 4, 5, 6, 7} + splat(by)), (__m512i)v);  // by its low bits
+  return two_of(v, mux(splat(others), number + splat(by), number), v);
 #else
   V r;
-  for (int l = 0; l < LANES; l++) r[l] = v[(l + by) & (LANES - 1)];
+  for (int l = 0; l < LANES; l++) r[l] = v[(l & ~others) | ((l + by) & others)];
   return r;
 #endif
 }
@@ -69,21 +65,21 @@ OUTLINE void fill_halo(const Context& c, Plane* p, int rows, bool around) {
       const V* from = p->data + (y - by * height) * words;
       V* to = around ? p->data + c.row(y) : (V*)row_or_nothing(c, p, y);
       V kept = splat(FULL);
-      if (!around) for (int l = 0; l < LANES; l++) kept[l] = l + by >= 0 && l + by < LANES ? FULL : 0;
-      for (int w = 0; w < words; w++) to[w] = turned(from[w], by) & kept;
+      if (!around) for (int l = 0; l < LANES; l++) kept[l] = (u32)(l % c.g.strips + by) < (u32)c.g.strips ? FULL : 0;
+      for (int w = 0; w < words; w++) to[w] = turned(c, from[w], by) & kept;
     }
   (around ? p->around : p->beyond) = rows;
 }
 // To be called before rows of other strips are read, up to `rows` away.
 ALWAYS void edges(const Context& c, Plane* p, int rows) {
-  if (c.g.strips && p->around < rows) fill_halo(c, p, rows, true);
+  if (c.g.strips > 1 && p->around < rows) fill_halo(c, p, rows, true);
 }
 ALWAYS void bare_edges(const Context& c, Plane* p, int rows) {
-  if (c.g.strips && p->beyond < rows) fill_halo(c, p, rows, false);
+  if (c.g.strips > 1 && p->beyond < rows) fill_halo(c, p, rows, false);
 }
 
 // Keys
-static inline u32 mix(u32 x) {
+template <class T> ALWAYS T mix(T x) {
   x ^= x >> 16;
   x *= 0x7FEB352Du;
   x ^= x >> 15;

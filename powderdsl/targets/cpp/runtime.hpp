@@ -21,13 +21,13 @@ struct Grid {
 #else
   int width, words, stride;
 #endif
-  bool strips;
+  int strips;  // of a world, in as many lanes; 1 if a lane is a world
   int cells() const { return height * words; }
   // Strips have halos: behind the rows of a plane lie those above and below on the torus, then the bare ones.
   int above(int y) const { return (height - 1 - y) * words; }  // y < 0
   int below(int y) const { return (AROUND_ROWS + y) * words; }  // y >= height
-  int halos() const { return strips ? 2 * (AROUND_ROWS + BEYOND_ROWS) * words : 0; }
-  int world_height() const { return strips ? height * LANES : height; }
+  int halos() const { return strips > 1 ? 2 * (AROUND_ROWS + BEYOND_ROWS) * words : 0; }
+  int world_height() const { return strips * height; }
   bool operator==(const Grid& g) const { return height == g.height && width == g.width && strips == g.strips; }
 };
 
@@ -49,7 +49,7 @@ struct Context {
   u32* marks;      // lanes that have anything in a row of some planes, see mark_rows
   float* waiting;  // rows of reals that loops some rows behind read
   float* zeros;
-  u32 world_keys[2][LANES];
+  U world_keys[2][PARTS], strip_starts[PARTS];
   U k0[STREAMS + 1][PARTS], k1[STREAMS + 1][PARTS];
   V* coins[COINS + 1];      // planes
   bool tossed[COINS + 1];  // whether this step has filled them

@@ -38,7 +38,7 @@ def pass_text(schedule: Schedule, number: int, layout: NativeLayout) -> str:
     if schedule.when is not None:
         lines.append(f"if (!{answer(schedule.when)}) return;")
     lines.append(
-        "const int words = c.g.words, height = c.g.height, width = c.g.width, strips = c.g.strips ? -1 : 0, "
+        "const int words = c.g.words, height = c.g.height, width = c.g.width, strips = c.g.strips, "
         "*rows = c.rows(); (void)words; (void)height; (void)width; (void)strips; (void)rows;"
     )
     rest = variables(schedule)

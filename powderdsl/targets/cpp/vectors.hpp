@@ -1,5 +1,5 @@
 // The library that generated code builds on. One group = LANES worlds side by side: lane l of every vector is world l.
-// Or, in strips: one world, cut into LANES strips of as many rows, one below the other; lane l is strip l.
+// Or, in strips: fewer worlds, each cut into strips of as many rows, one below the other, in lanes side by side.
 // A plane is one bit a cell: 64 columns in a word, or as many as worlds have if those are 16 or 32; a vector holds the same
 // word of all worlds of the group.
 // Reals lie by world and row, with a halo of wrapped columns on both sides. Nothing here knows any rule.
@@ -111,6 +111,17 @@ ALWAYS V rotated(V x, int by) {  // each word to the right, by less than its wid
 #endif
 }
 ALWAYS V mux(V c, V a, V b) { return (c & a) | (~c & b); }
+#if VECTOR == 64
+ALWAYS V two_of(V a, V which, V b) {  // words of a, then of b, by their numbers
+#if WIDTH == 16
+  return (V)_mm512_permutex2var_epi16((__m512i)a, (__m512i)which, (__m512i)b);
+#elif WIDTH == 32
+  return (V)_mm512_permutex2var_epi32((__m512i)a, (__m512i)which, (__m512i)b);
+#else
+  return (V)_mm512_permutex2var_epi64((__m512i)a, (__m512i)which, (__m512i)b);
+#endif
+}
+#endif
 
 // The flags of a chunk as bits, and back as a choice between two vectors.
 ALWAYS u32 bits_of(I m) {

@@ -77,7 +77,7 @@ struct Lanes {
   int first, last;
 };
 static Lanes lanes_of(const Batch& b, int first, int last) {
-  return b.g.strips ? Lanes{first * LANES, last * LANES} : Lanes{first, last};
+  return Lanes{first * b.g.strips, last * b.g.strips};
 }
 template <class T> static void store_values(const Batch& b, Lanes some, int slot, int bits, int negative, T* data, int64_t apart) {
   for (int lane = some.first; lane < some.last; lane++) {
@@ -342,11 +342,11 @@ struct Counts {
 };
 static V mask_row(const Batch& b, const u64* mask, int64_t apart, int n, int y, int w) {
   const Grid& g = b.g;
-  if (!g.strips && !apart) return splat(mask[(size_t)y * g.words + w]);
+  if (g.strips == 1 && !apart) return splat(mask[(size_t)y * g.words + w]);
   V row = splat(0);
   for (int l = 0; l < LANES; l++) {
-    const int64_t world = g.strips ? n : std::min(n * LANES + l, b.worlds - 1);
-    row[l] = mask[world * apart + ((size_t)(g.strips ? l * g.height : 0) + y) * g.words + w];
+    const int64_t world = std::min((n * LANES + l) / g.strips, b.worlds - 1);
+    row[l] = mask[world * apart + ((size_t)(l % g.strips) * g.height + y) * g.words + w];
   }
   return row;
 }
@@ -354,7 +354,7 @@ static V mask_row(const Batch& b, const u64* mask, int64_t apart, int n, int y, 
 static void count_cells(const Batch& b, const Counts& c, const u64* masks, int64_t apart, const double* sizes, int64_t sizes_apart, double* values) {
   const Grid& g = b.g;
   const size_t mask_words = (size_t)g.world_height() * g.words;
-  const int first = g.strips ? 0 : c.top, last = g.strips ? g.height : c.bottom, rest = g.width - BITS * (g.words - 1);
+  const int first = g.strips > 1 ? 0 : c.top, last = g.strips > 1 ? g.height : c.bottom, rest = g.width - BITS * (g.words - 1);
   const V whole = splat(FULL), edge = splat(FULL >> (BITS - rest));
   V* value = aligned<V>(c.gates + 1);
   std::vector<int64_t> total((size_t)c.counts * LANES);
@@ -381,7 +381,7 @@ static void count_cells(const Batch& b, const Counts& c, const u64* masks, int64
         for (int l = 0; l < LANES; l++) {
           int64_t& sum = total[(size_t)k * LANES + l];
           if (!c.count[k].highest) sum += __builtin_popcountll(cells[l]);
-          else if (cells[l]) sum = std::max<int64_t>(sum, g.world_height() - (g.strips ? l * g.height + y : y));
+          else if (cells[l]) sum = std::max<int64_t>(sum, g.world_height() - (l % g.strips * g.height + y));
         }
       }
     }
@@ -389,7 +389,7 @@ static void count_cells(const Batch& b, const Counts& c, const u64* masks, int64
       for (int l = 0; l < LANES; l++) {
         const int lane = n * LANES + l;
         if (lane >= b.lanes()) break;
-        double& sum = values[(size_t)(g.strips ? lane / LANES : lane) * c.numbers + c.count[k].number];
+        double& sum = values[(size_t)(lane / g.strips) * c.numbers + c.count[k].number];
         const double part = c.count[k].weight * (double)total[(size_t)k * LANES + l];
         sum = c.count[k].highest ? std::max(sum, part) : sum + part;
       }
