@@ -13,6 +13,7 @@ import sys
 import time
 from collections import Counter
 from collections.abc import Iterator, Sequence
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -37,10 +38,16 @@ UNCOUNTED = {"powderworld2"}
 """Rules whose mutants have not been counted yet: it takes hours."""
 
 
+@cache
 def compositions() -> dict[str, tuple[str, ...]]:
-    """What is judged: rules, and which of their packs; none for all of them."""
-    counted = [name for name in shipped_tests() if name not in shipped_variants() | UNCOUNTED]
-    return {**dict.fromkeys(counted, ()), **EXAMPLES}
+    """What is judged: rules, and which of their packs, each in the first rules that load it."""
+    chosen: dict[str, tuple[str, ...]] = {}
+    for rules in shipped_tests():
+        if rules not in shipped_variants() | UNCOUNTED:
+            known = {pack for packs in chosen.values() for pack in packs}
+            names = [pack.name.text for pack in read([rules], Reporter())[0]]
+            chosen[rules] = tuple(name for name in names if name not in known)
+    return {**chosen, **EXAMPLES}
 
 
 Counts = dict[str, dict[str, int]]
@@ -49,9 +56,7 @@ Counts = dict[str, dict[str, int]]
 
 def packs_of(rules: str) -> list[str]:
     """The packs of a composition that are mutated, in their order."""
-    only = compositions()[rules]
-    packs, _ = read([rules], Reporter())
-    return [pack.name.text for pack in packs if not only or pack.name.text in only]
+    return list(compositions()[rules])
 
 
 def count(rules: str, packs: Sequence[str], jobs: int) -> Iterator[Counts]:

@@ -16,6 +16,7 @@ from powderdsl.testing.mutation.judging import (
     COUNTED,
     Original,
     broken_invariant,
+    judge,
     noticed_share,
     run_campaign,
 )
@@ -85,6 +86,22 @@ def test_invariants_about_properties_and_tags_are_asked_where_no_world_differs(t
     mutant = load_text(ROCK.replace(right, wrong))
     broken = broken_invariant(Original.of(str(path)), compile(mutant, backend="wasm"))
     assert broken.span.text == claim
+
+
+def test_a_pack_is_in_the_table_once():
+    packs = [pack for rules in TABLE.compositions() for pack in TABLE.packs_of(rules)]
+    assert len(packs) == len(set(packs))
+
+
+def test_tests_run_with_what_a_pack_needs_then_with_what_its_tests_name():
+    world = Original.of("powderworld2")
+    small, larger = ({pack.name.text for pack in part.packs} for part in world.parts("climbing"))
+    assert small == {"core2", "water", "plant", "climbing"}
+    assert small < larger < {pack.name.text for pack in world.packs}
+    (mutant, *_) = (m for m in world.mutants(frozenset({"climbing"})) if m.operator == "chance")
+    verdict = judge(world, mutant)
+    assert verdict.by == "test"
+    assert "sim" not in vars(world), "the whole has not been compiled"
 
 
 @pytest.mark.slow

@@ -13,6 +13,7 @@ from collections import Counter
 from collections.abc import Collection, Generator, Iterable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache, partial
 from itertools import cycle
@@ -21,7 +22,7 @@ from multiprocessing import active_children, get_context, parent_process
 from pathlib import Path
 from textwrap import indent
 from threading import Thread
-from typing import ClassVar, Self
+from typing import Any, ClassVar, Self
 
 import numpy as np
 
@@ -29,20 +30,19 @@ from powderdsl.analysis.proofs import horizon
 from powderdsl.compiler import read
 from powderdsl.diagnostics import CompileError, Diagnostic, Reporter, Severity, Source
 from powderdsl.model.check import check
-from powderdsl.model.composition.names import needs_of
+from powderdsl.model.composition.names import needs_of, with_stand_ins
 from powderdsl.model.declarations import PackDecl, RulesetDecl, read_file
 from powderdsl.model.definitions import set_params
 from powderdsl.model.types import Element, Example, Local, Ruleset, Symmetric
-from powderdsl.simulation.draw import to_numpy
 from powderdsl.simulation.programs import starting_backend
 from powderdsl.simulation.simulator import Simulator, World, compile
 from powderdsl.syntax.yaml_tree import Mapping as YamlMapping
 from powderdsl.syntax.yaml_tree import Sequence as YamlSequence
 from powderdsl.syntax.yaml_tree import parse_yaml
+from powderdsl.system.cache import Memo
 from powderdsl.system.interrupts import delay_signal
 from powderdsl.system.settings import fingerprint
 from powderdsl.system.writing import write_text
-from powderdsl.testing.generators.cases import Array
 from powderdsl.testing.mutation.operators import Mutant, mutants_of
 from powderdsl.testing.pack_tests.runner import ANYTHING, SEEDS, field_rows, run_examples
 from powderdsl.testing.properties.comparison import Distinction, compare
@@ -52,14 +52,6 @@ from powderdsl.testing.properties.search import STEPS, InvariantSearch, SearchPl
 
 Settings = tuple[tuple[str, str], ...]
 """Parameters and their values as text."""
-
-WORLDS = 1000
-"""Random worlds that invariants are tried on, as many as `powderdsl test` tries."""
-
-
-def is_generated(example: Example) -> bool:
-    """True if a test was written by the tool."""
-    return example.name.startswith(GENERATED)
 
 
 @dataclass(eq=False)
@@ -83,6 +75,24 @@ class Original:
         reporter.raise_if_errors()
         return cls(rules, settings, packs, declaration, ruleset, warnings_of(reporter.diagnostics))
 
+    @lru_cache(maxsize=64)  # noqa: B019
+    def parts(self, pack: str) -> list[Original]:
+        """Smaller compositions, in which most tests of a pack run sooner: it with what it needs, and with what they name."""
+        needs = needs_of(with_stand_ins(self.packs))
+        homes = {element.name: element.pack for element in self.ruleset.elements}
+        named, loaded = set[str](), []
+        for test in self.ruleset.tests:
+            if test.pack == pack:
+                drawn = "".join((*test.given, *(test.expect or ())))
+                named |= {homes[name] for glyph, name in test.legend if glyph in drawn}
+        some = {frozenset(needs[pack]), frozenset(needs[pack]).union(*map(needs.__getitem__, named))}
+        for names in sorted(some - {frozenset(needs)}, key=len):
+            files = (decl.source.name for decl in self.packs if decl.name.text in names)
+            settings = tuple(item for item in self.settings if item[0].partition(".")[0] in names)
+            with suppress(CompileError):
+                loaded.append(Original.of("+".join(files), settings))
+        return loaded
+
     def mutants(self, only: frozenset[str] = frozenset()) -> list[Mutant]:
         """The mutants of all packs, or of some, in the order of the packs and their files."""
         return [
@@ -105,14 +115,14 @@ class Original:
 
     @cached_property
     def sim(self) -> Simulator:
-        return compile(self.ruleset, backend=starting_backend("cpu"))
+        """Runs it. Simulators of mutants are made from it, and compile only the passes that differ."""
+        return compile(self.ruleset, starting_backend("cpu"), tensors=False, memo=Memo())
 
-    @cached_property
-    def failing(self) -> frozenset[str]:
-        """Names of tests that fail without any mistake: their failing says nothing."""
-        return frozenset(
-            result.example.name for result in run_examples(self.ruleset, sim=self.sim) if not result.passed
-        )
+    @lru_cache(maxsize=1000)  # noqa: B019
+    def holds(self, name: str) -> bool:
+        """True if the tests of a name pass without any mistake: if they do not, their failing says nothing."""
+        tests = tuple(test for test in self.ruleset.tests if test.name == name)
+        return all(result.passed for result in run_examples(replace(self.ruleset, tests=tests), sim=self.sim))
 
     @cached_property
     def fingerprint(self) -> str:
@@ -133,16 +143,10 @@ def warnings_of(diagnostics: tuple[Diagnostic, ...]) -> Counter[str]:
 # Verdicts
 
 NOTICED = ("check", "invariant", "test", "generated")
-"""The checks that may notice a mutant. `test`: tests written by hand; the quick ones run before invariants."""
-
-AT_ONCE = "torch"
-"""Runs the quick tests and the random worlds, which have many widths: others compile for each width."""
-
-FEW_STEPS = 20
-"""Tests of at most this many steps run before longer ones."""
+"""The checks that may notice a mutant. `test`: tests written by hand; most run before invariants."""
 
 PROOF = 30.0
-"""Seconds of work, counted, for a proof that a mutant is equal."""
+"""Seconds of work, counted, for a proof that a mutant is equal. A tenth comes first, before what takes longer."""
 
 PAIRED = 6
 """Batches of worlds on which invariants are tried that compare several runs."""
@@ -164,8 +168,18 @@ class Verdict:
     test: GeneratedTest | None = None
 
 
-def judge(original: Original, mutant: Mutant) -> Verdict:
-    """Hold a mutant against everything that its composition says about itself, cheapest first."""
+def judge(original: Original, mutant: Mutant, seed: int = 0) -> Verdict:
+    """Hold a mutant against everything that its composition says about itself, cheapest first.
+
+    Tests run in the parts of the composition before it is loaded as a whole.
+    """
+    for part in original.parts(mutant.pack):
+        with suppress(CompileError):  # it may be about another pack
+            mutated = part.mutated(mutant)
+            if mutated is None or mutated[1] - part.warnings:
+                break
+            if failed := failed_test(part, part.sim.of(mutated[0]), mutant.pack, quick=True):
+                return failed
     try:
         mutated = original.mutated(mutant)
     except CompileError as error:
@@ -173,44 +187,53 @@ def judge(original: Original, mutant: Mutant) -> Verdict:
     if mutated is None:
         return Verdict("invalid")
     ruleset, warnings = mutated
-    new = warnings - original.warnings
-    if new:
+    if new := warnings - original.warnings:
         return Verdict("killed", "check", min(new))
     if fingerprint(ruleset) == original.fingerprint:
         return Verdict("equivalent", "the same model")
-    sim = compile(ruleset, backend=AT_ONCE)
-    failed = failed_test(original, sim, mutant.pack, quick=True)
-    if failed is None:
-        broken = broken_invariant(original, sim)
-        if broken is not None:
-            return Verdict("killed", "invariant", broken.text)
-        sim = compile(ruleset, backend=starting_backend("cpu"))
-        failed = failed_test(original, sim, mutant.pack, quick=False)
-    if failed is not None:
-        by = "generated" if is_generated(failed) else "test"
-        return Verdict("killed", by, f"{failed.pack}: {failed.name}")
-    return Verdict("survived")
+    sim, focus = original.sim.of(ruleset), focused(original, mutant)
+    if failed := failed_test(original, sim, mutant.pack, quick=True):
+        return failed
+    comparison = compare(original.sim, sim, PROOF / 10, focus, seed)
+    said, before = ((r.invariants, [p.values for p in r.properties]) for r in (ruleset, original.ruleset))
+    different = comparison.status != "equal" or said != before  # otherwise it breaks what the original breaks
+    if different and (broken := broken_invariant(original, sim)):
+        return Verdict("killed", "invariant", broken.text)
+    if comparison.status != "equal":
+        if failed := failed_test(original, sim, mutant.pack, quick=False):
+            return failed
+        if comparison.distinction is None:
+            comparison = compare(original.sim, sim, PROOF, focus, seed)
+    if comparison.status == "equal":
+        return Verdict("equivalent", "a proof")
+    distinction = comparison.distinction
+    if distinction is None or distinction.draws:  # a test needs a seed
+        return Verdict("survived", differs_in=distinction.slot if distinction else None)
+    test = written_test(mutant, distinction, original.sim, original.packs)
+    return Verdict("survived", differs_in=distinction.slot, test=test)
 
 
 # Tests
 
 
-def failed_test(original: Original, sim: Simulator, pack: str, *, quick: bool) -> Example | None:
-    """A test that the original passes and the mutant fails: one written by hand, if there is one.
+def failed_test(original: Original, sim: Simulator, pack: str, *, quick: bool) -> Verdict | None:
+    """The verdict by a test that the original passes and the mutant fails: one written by hand, if there is one.
 
-    `quick`: only tests that cost less than invariants; otherwise only the others. Exact ones run before counted ones,
-    each of which runs many worlds, those of the mutated pack before others, short ones before long ones.
+    `quick`: only tests that cost less than invariants; otherwise only the others. Counted ones, each of which runs many
+    worlds, run after exact ones and cost more, unless they are of the mutated pack and most likely to fail.
     """
 
-    def cost(example: Example) -> tuple[bool, bool, bool, bool]:
-        return is_generated(example), bool(example.often), example.steps > FEW_STEPS, example.pack != pack
+    def cost(example: Example) -> tuple[bool, bool, bool, bool, int]:
+        counted, other = bool(example.often), example.pack != pack
+        return example.name.startswith(GENERATED), counted and other, counted, other, example.steps
 
     for example in sorted(sim.ruleset.tests, key=cost):
-        if (not any(cost(example)[:3])) == quick and example.name not in original.failing:
+        if (not any(cost(example)[:2])) == quick:
             alone = replace(example, scope=())  # which added packs make a test fail does not matter here
             (result,) = run_examples(replace(sim.ruleset, tests=(alone,)), sim=sim)
-            if not result.passed:
-                return example
+            if not result.passed and original.holds(example.name):
+                by = "generated" if cost(example)[0] else "test"
+                return Verdict("killed", by, f"{example.pack}: {example.name}")
     return None
 
 
@@ -235,13 +258,13 @@ class InvariantTrials(InvariantSearch):
             drawn = isinstance(claim, Symmetric) and ruleset.streams
             if not holds and not drawn and prop.text not in without:
                 trials.append(Result(prop))
-        return cls(Runner(ruleset, sim=sim), SearchPlan(WORLDS, inf), trials)
+        return cls(Runner(ruleset, sim=sim), SearchPlan(seconds=inf), trials)
 
 
 def broken_invariant(original: Original, sim: Simulator) -> Property | None:
     """An invariant of the mutant that some random world breaks."""
     search = InvariantTrials.on(sim, original.broken)
-    samples = random_samples(sim.ruleset, search.plan.seed, WORLDS) if search.trials else ()
+    samples = random_samples(sim.ruleset, search.plan.seed, search.plan.examples) if search.trials else ()
     for sample, steps in zip(samples, cycle(STEPS), strict=False):
         search.try_sample(sample, steps)
         broken = next((trial.prop for trial in search.trials if trial.sample is not None), None)
@@ -318,6 +341,7 @@ def _begin_process() -> None:
         os._exit(1)
 
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    os.environ["XDG_CACHE_HOME"] = os.devnull  # nobody compiles a mutant again
     Thread(target=end_with_parent, daemon=True).start()
 
 
@@ -332,19 +356,7 @@ def work(
 ) -> tuple[int, Verdict]:
     """Judge the mutant of this number among all of a composition."""
     original, mutants = _loaded(rules, settings, packs)
-    mutant = mutants[number]
-    verdict = judge(original, mutant)
-    mutated = original.mutated(mutant) if verdict.status == "survived" else None
-    if mutated is None:
-        return number, verdict
-    sim = compile(mutated[0], backend=starting_backend("cpu"))  # few mutants come this far
-    comparison = compare(original.sim, sim, PROOF, focused(original, mutant), seed)
-    if comparison.status == "equal":
-        return number, Verdict("equivalent", "a proof")
-    if comparison.distinction is None or comparison.distinction.draws:  # a test needs a seed
-        return number, verdict
-    test = written_test(mutant, comparison.distinction, original.sim, original.packs)
-    return number, replace(verdict, differs_in=comparison.distinction.slot, test=test)
+    return number, judge(original, mutants[number], seed)
 
 
 def focused(original: Original, mutant: Mutant) -> tuple[int, ...]:
@@ -405,7 +417,10 @@ def written_test(
         seed = None
     before, wanted = distinction.sample.ids[0], distinction.first["element"][0]
     there = [e for e in ruleset.elements if e.id in np.unique([*before.ravel(), *wanted.ravel()])]
-    glyphs, legend = _legend(there, ruleset, packs, mutant.pack)
+    needed = needs_of(with_stand_ins(packs))[mutant.pack]
+    homes = {p.name: p.pack for p in ruleset.properties} | {f.name: f.pack for f in ruleset.fields}
+    maybe = {name: "?" * (pack not in needed) for name, pack in homes.items()}
+    glyphs, legend = _legend(there, ruleset, packs, needed)
     digest = hashlib.sha256(re.sub(r":\d+", "", mutant.key).encode()).hexdigest()[:6]
     name = f"{GENERATED}{digest} against {mutant.operator} in {_where(mutant)}"
     lines = [f"- {name}:"]
@@ -414,48 +429,33 @@ def written_test(
         items = ", ".join(f"{glyph}: {element}" for glyph, element in quoted)
         lines.append(f"    legend: {{{items}}}")
     lines += ["    given: |", *_drawn(before, glyphs)]
-    needed = needs_of({decl.name.text: decl for decl in packs})[mutant.pack]
     start = run_sample(sim, distinction.sample, 0)[1]
     usual = sim.world(distinction.sample.ids)
     for field in distinction.sample.fields:
-        same = _same(*(to_numpy(world.state[field][0]) for world in (start, usual)))
-        words = _words(field, start, same, ".")
+        words = _words(field, start, usual.state[field][0], start.state[field][0], ".")
         if words:
             lines += ["    fields:"] if "    fields:" not in lines else []
-            lines += [f"      {_known(field, ruleset, needed)}: |", *words]
+            lines += [f"      {field}{maybe[field]}: |", *words]
     lines.append(f"    after: {distinction.steps} step{'' if distinction.steps == 1 else 's'}")
     if distinction.slot == "element":
         lines += ["    expect: |", *_drawn(wanted, glyphs)]
     else:
         end = run_sample(sim, distinction.sample, distinction.steps)[1]
-        same = _same(distinction.first[distinction.slot][0], distinction.second[distinction.slot][0])
-        name_ = _known(distinction.slot, ruleset, needed)
-        lines += ["    expect_fields:", f"      {name_}: |", *_words(distinction.slot, end, same, ANYTHING)]
+        slot = distinction.slot
+        words = _words(slot, end, distinction.first[slot][0], distinction.second[slot][0], ANYTHING)
+        lines += ["    expect_fields:", f"      {slot}{maybe[slot]}: |", *words]
     if seed is not None:
         lines.append(f"    seed: {seed}")
     return GeneratedTest(mutant.pack, name, "\n".join(lines) + "\n")
 
 
-def _same(first: Array, second: Array) -> Array:
-    """bool [H, W]: cells in which a field of two worlds is the same."""
+def _words(field: str, world: World, first: Any, second: Any, filler: str) -> list[str]:
+    """A drawing of a field, with a filler for cells in which two worlds have the same; empty if all have."""
     same = np.asarray(first == second)
-    return np.asarray(same.all(0)) if same.ndim == 3 else same
-
-
-def _words(field: str, world: World, same: np.ndarray, filler: str) -> list[str]:
-    """A drawing of a field, with a filler for cells that do not matter; empty if no cell matters."""
-    if same.all():
-        return []
+    same = np.asarray(same.all(0)) if same.ndim == 3 else same
     rows = [row.split() for row in field_rows(field, world, 0)]
     rows_ = [[filler if same[y, x] else word for x, word in enumerate(words)] for y, words in enumerate(rows)]
-    return ["        " + " ".join(words) for words in rows_]
-
-
-def _known(field: str, ruleset: Ruleset, needed: Collection[str]) -> str:
-    """A field's name, with `?` if its pack may be absent."""
-    declared = ruleset.property(field) or ruleset.field(field)
-    assert declared is not None
-    return field if declared.pack in needed else f"{field}?"
+    return [] if same.all() else ["        " + " ".join(words) for words in rows_]
 
 
 def _drawn(ids: np.ndarray, glyphs: dict[int, str]) -> list[str]:
@@ -470,14 +470,13 @@ def _where(mutant: Mutant) -> str:
 
 
 def _legend(
-    there: Sequence[Element], ruleset: Ruleset, packs: Sequence[PackDecl], pack: str
+    there: Sequence[Element], ruleset: Ruleset, packs: Sequence[PackDecl], needed: Collection[str]
 ) -> tuple[dict[int, str], list[tuple[str, str]]]:
     """A character for each element, and those that a legend must explain.
 
     Characters that packs choose themselves are known wherever these are loaded; all others depend on what else is
     loaded. Elements of packs that this one does not need may be absent: the test then waits.
     """
-    needed = needs_of({decl.name.text: decl for decl in packs})[pack]
     chosen = {f"{pack.name.text}.{decl.name.text}" for pack in packs for decl in pack.elements if decl.glyph}
     known = {e.qualified: e.glyph for e in ruleset.elements if e.pack in needed and e.qualified in chosen}
     glyphs: dict[int, str] = {}
