@@ -227,7 +227,7 @@ SECTIONS = {
     "Network": "network observation features frames width",
     "Cloning": "init-from init-expert init-epochs",
     "Training": "rollout batch epochs learning-rate schedule gamma gae-lambda clip entropy vf-coef max-grad-norm target-kl "
-    "normalize buffer refresh",
+    "normalize precision buffer refresh",
     "Evaluation": "eval-every eval-split eval-episodes",
     "Counterexamples": "replay picture keep",
     "Mutants": "mutate mutants write jobs",

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from gymnasium import spaces
@@ -60,12 +60,6 @@ class MatrixPatches(nn.Module):
         return self.get_buffer("rows") @ observed @ self.get_buffer("columns")
 
 
-class Counts(NamedTuple):
-    """What `Patches.count` made of observations; the module takes them in their place."""
-
-    numbers: Tensor
-
-
 class Patches(MatrixPatches):
     """From bytes uint8 [B, C, H, W] to float32 [B, E + C − 1, rows, columns]: how much of each patch each element
     takes, and the means of all other channels.
@@ -83,27 +77,24 @@ class Patches(MatrixPatches):
         rows, columns = self.get_buffer("rows").T, self.get_buffer("columns")
         share = rows.amax(0)[:, None] * columns.amax(0)  # one cell's part of its patch
         self.register_buffer("share", share[..., None].contiguous())
+        wide = share[..., None].repeat(1, 1, elements)  # in the shape of counts, which is faster
+        self.register_buffer("shares", wide, persistent=False)
         self.register_buffer("values", values.float().cpu())
-
-    @property
-    def counts_all(self) -> bool:
-        """Whether counts are all that it makes patches of: the first channel is the only one."""
-        return len(self.get_buffer("values")) == 1
+        self.one_channel = len(values) == 1 < patches[0]
+        """Whether `count` gives all there is to see, in another shape than observations have."""
 
     def count(self, observed: Tensor) -> Tensor:
-        """How many cells of each patch each element takes, float32 [B, rows, columns, E]."""
+        """How many cells of each patch each element takes, int64 [B, rows, columns, E]."""
         batch, count = len(observed), self.patches[0] * self.patches[1] * self.elements
-        start = torch.arange(batch, device=observed.device) * count
-        number = observed[:, 0].long().add_(self.get_buffer("first")).add_(start[:, None, None]).flatten()
-        counts = torch.zeros(batch * count, device=observed.device)
-        counts.scatter_add_(0, number, counts.new_ones(1).expand(len(number)))
+        start = torch.arange(batch, dtype=torch.int32, device=observed.device) * count
+        number = observed[:, 0].int().add_(self.get_buffer("first")).add_(start[:, None, None])
+        counts = torch.bincount(number.flatten(), minlength=batch * count)
         return counts.view(batch, *self.patches, self.elements)
 
-    def forward(self, observed: Tensor | Counts) -> Tensor:
-        """Bytes, or the same numbers as floats; or counts, if there is one channel. Channels are the last in memory."""
-        if isinstance(observed, Counts):
-            return (observed.numbers * self.get_buffer("share")).permute(0, 3, 1, 2)
-        parts = [(self.count(observed) * self.get_buffer("share")).permute(0, 3, 1, 2)]
+    def forward(self, observed: Tensor) -> Tensor:
+        """Bytes, or the same numbers as floats; if they have one channel, also what `count` made of them."""
+        counts = observed if self.one_channel and observed.shape[1] > 1 else self.count(observed)
+        parts = [(counts * self.get_buffer("shares")).permute(0, 3, 1, 2)]  # channels are the last in memory
         values = self.get_buffer("values")
         for channel in range(1, len(values)):
             cells = values[channel].index_select(0, observed[:, channel].int().flatten())
@@ -137,12 +128,12 @@ class Features(BaseFeaturesExtractor):
         features_dim: int,
         see: nn.Module,
         channels: int,
-        widths: tuple[int, int],
-        shapes: tuple[tuple[int, int, int], tuple[int, int, int]],
+        widths: Any,
+        shapes: Any,
     ):
         super().__init__(observation_space, features_dim)
         first, second = nn.Conv2d(channels, widths[0], *shapes[0]), nn.Conv2d(*widths, *shapes[1])
-        convolutions = nn.Sequential(see, first, nn.ReLU(True), second, nn.ReLU(True), nn.Flatten())
+        convolutions = nn.Sequential(see, first, nn.ReLU(True), second, nn.Flatten(), nn.ReLU(True))
         with torch.no_grad():
             width = convolutions(torch.zeros(1, *observation_space.shape)).shape[1]
         self.layers = nn.Sequential(convolutions, nn.Linear(width, features_dim), nn.ReLU())
@@ -188,7 +179,7 @@ def paper_policy(env: TensorEnv, features_dim: int = 256, frames: int = 1) -> di
         shown = [channel for channel, source in enumerate(sources) if every or source == 0]
         see = Expand(tuple(sources[channel] for channel in shown), tables[shown].cpu())
         see, channels = (see if frames == 1 else Frames(see, frames)), len(shown) * frames
-    return _policy(features_dim, see, channels, (32, 64), ((3, 2, 0), (3, 2, 0)))
+    return _policy(features_dim, see=see, channels=channels, widths=(32, 64), shapes=((3, 2, 0), (3, 2, 0)))
 
 
 def small_policy(env: TensorEnv, features_dim: int = 128, frames: int = 1) -> dict[str, Any]:
@@ -202,7 +193,9 @@ def small_policy(env: TensorEnv, features_dim: int = 128, frames: int = 1) -> di
         for side, count in zip(env.task.size, env.task.agent.bins, strict=True)
     )
     see = patches_of(env, (rows, columns), frames)
-    return _policy(features_dim, see, see.channels, (32, 32), ((3, 2, 1), (3, 1, 1)))
+    return _policy(
+        features_dim, see=see, channels=see.channels, widths=(32, 32), shapes=((3, 2, 1), (3, 1, 1))
+    )
 
 
 def _refuse_pictures(env: TensorEnv) -> None:
@@ -210,16 +203,10 @@ def _refuse_pictures(env: TensorEnv) -> None:
         raise ValueError("this network does not take pictures: use the policy's own")
 
 
-def _policy(features_dim: int, see: nn.Module, channels: int, widths: Any, shapes: Any) -> dict[str, Any]:
+def _policy(features_dim: int, **how: Any) -> dict[str, Any]:
     return {
         "features_extractor_class": Features,
-        "features_extractor_kwargs": {
-            "features_dim": features_dim,
-            "see": see,
-            "channels": channels,
-            "widths": widths,
-            "shapes": shapes,
-        },
+        "features_extractor_kwargs": {"features_dim": features_dim, **how},
         "net_arch": [features_dim],
         "normalize_images": False,
     }

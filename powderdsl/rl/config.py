@@ -74,6 +74,9 @@ class TrainConfig:
     normalize: str = setting(
         "advantage", "What is divided by its spread.", choices=("advantage", "reward", "both", "none")
     )
+    precision: str = setting(
+        "float32", "Numbers that layers compute with; weights are float32.", choices=("float32", "bfloat16")
+    )
     seed: int = setting(0, "Of the run: worlds, network, and actions.", 0, 2**32 - 1)
     steps: int = setting(
         1_000_000, "Interactions, of all worlds together, such as 2e5.", 1, 10**12, may_change=True
@@ -107,6 +110,8 @@ class TrainConfig:
     def identity(self) -> dict[str, Any]:
         """The settings that the result depends on: all but those of HOW. A falling learning rate depends on `steps`."""
         settings = {name: value for name, value in self.as_json().items() if name not in HOW}
+        if self.precision == "float32":
+            del settings["precision"]  # runs that are older have none
         return settings if self.schedule == "constant" else {**settings, "steps": self.steps}
 
 

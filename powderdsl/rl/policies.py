@@ -51,13 +51,6 @@ def fcn_policy(env: TensorEnv, channels: int = 32, frames: int = 1) -> dict[str,
     return {"see": patches_of(env, bins, frames), "channels": channels, "bins": bins, "form": form}
 
 
-class PatchPolicy(ActorCriticCnnPolicy):
-    """The usual policy, whose features are made of the bytes of observations, without a copy as floats, or of `Counts`."""
-
-    def extract_features(self, obs: Any, features_extractor: Any = None) -> Any:
-        return self.features_extractor(obs)
-
-
 class Trunk(nn.Module):
     """From patches [B, C, rows, columns], with their places among the channels, to features [B, F, rows, columns]."""
 
@@ -70,9 +63,33 @@ class Trunk(nn.Module):
     def forward(self, patches: Tensor) -> Tensor:
         features = self.first(patches).relu_()
         for block, mean in zip(self.blocks, self.means, strict=True):
-            added = block(features).add_(mean(features.mean((2, 3)))[:, :, None, None])
-            features = features + added.relu_()
+            weights = [one.to(features.dtype) for one in (*block.parameters(), *mean.parameters())]
+            features = Residual.apply(features, *weights, block.dilation)
         return features
+
+
+class Residual(torch.autograd.Function):
+    """``x + (convolution(x) + linear(mean(x))).relu()``, which writes fewer tensors than its parts do one by one."""
+
+    @staticmethod
+    def forward(ctx: Any, x: Tensor, *given: Any) -> Tensor:
+        kernel, bias, matrix, shift, d = given
+        mean = x.mean((2, 3))
+        added = torch.conv2d(x, kernel, bias, padding=d, dilation=d)
+        added.add_(torch.addmm(shift, mean, matrix.T)[:, :, None, None]).relu_()
+        ctx.save_for_backward(x, kernel, matrix, mean, added)
+        ctx.d = d
+        return x + added
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Tensor) -> Any:
+        (x, kernel, matrix, mean, added), d, call = ctx.saved_tensors, ctx.d, torch.ops.aten
+        inner = call.threshold_backward(grads[0], added, 0)
+        sums = inner.sum((2, 3))
+        how = None, (1, 1), d, d, False, (0, 0), 1, (True, True, False)
+        back, kernels, _ = call.convolution_backward(inner, x, kernel, *how)
+        back.add_(grads[0]).add_((sums @ matrix / x[0, 0].numel())[:, :, None, None])
+        return back, kernels, sums.sum(0), sums.T @ mean, sums.sum(0), None
 
 
 @dataclass(frozen=True)
@@ -192,7 +209,16 @@ def policy_of(config: TrainConfig, env: TensorEnv) -> tuple[type[ActorCriticPoli
         return BinPolicy, fcn_policy(env, config.features, config.frames)
     build = paper_policy if config.network == "paper" else small_policy
     how = build(env, features_dim=config.features, frames=config.frames)
-    return PatchPolicy, {**how, "optimizer_kwargs": OPTIMIZER}
+    return ActorCriticCnnPolicy, {**how, "optimizer_kwargs": OPTIMIZER}
+
+
+def compute_in(precision: str, policy: ActorCriticPolicy) -> None:
+    """Let the layers of a policy compute in ``bfloat16``, except for the last ones; ``float32`` is what they do already."""
+    net: Any = policy
+    layers = [net.trunk, *net.judge[:-1]] if isinstance(policy, BinPolicy) else [net.features_extractor]
+    for layer in layers if precision == "bfloat16" else ():
+        call = torch.autocast(policy.device.type, torch.bfloat16)(layer.forward)
+        layer.forward = lambda seen, call=call: call(seen).float()
 
 
 @dataclass(frozen=True)
@@ -269,6 +295,7 @@ def load_policy(run: RunFolder | str | Path, env: TensorEnv, *, deterministic: b
     with reporting_misfits(folder.path, "its network is another"):
         network.load_state_dict(checkpoint.state["policy"])
     network.to(env.device).set_training_mode(False)
+    compute_in(config.precision, network)
     channels = len(own.observation.channels)
     return TrainedPolicy(network, config.observation, channels, checkpoint.step, deterministic, config.frames)
 

@@ -6,13 +6,17 @@ random numbers. Files are read with ``weights_only``: networks are built from th
 
 from __future__ import annotations
 
+import ctypes
 import random
+import sys
 import time
 import warnings
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from copy import deepcopy
+from functools import partial
+from itertools import accumulate
 from pathlib import Path
 from statistics import fmean
 from typing import Any
@@ -32,7 +36,7 @@ from torch.distributions import Distribution
 from powderdsl.compiler import whole_palette
 from powderdsl.datasets.dataset import Dataset, Transitions, drawn
 from powderdsl.datasets.recorder import record
-from powderdsl.envs.features import Counts, Patches
+from powderdsl.envs.features import Patches
 from powderdsl.envs.sb3 import PowderVecEnv
 from powderdsl.envs.tensor_env import channels_of, check_cells
 from powderdsl.experiments.runs import (
@@ -46,7 +50,7 @@ from powderdsl.experiments.runs import (
 )
 from powderdsl.rl.config import TrainConfig, check_task, from_json
 from powderdsl.rl.evaluation import play
-from powderdsl.rl.policies import TrainedPolicy, policy_of
+from powderdsl.rl.policies import TrainedPolicy, compute_in, policy_of
 from powderdsl.simulation.observe import Observer
 from powderdsl.system.settings import fingerprint
 from powderdsl.system.writing import failure
@@ -56,6 +60,8 @@ from powderdsl.tasks.shipped import load_task
 KIND = "ppo"
 ASKED = "asked.json"
 """The settings of the latest call, with those that may change."""
+SPEED = "speed.json"
+"""How many interactions the latest call trained, in how many seconds, and how many of these went where."""
 DEMONSTRATIONS = "demonstrations"
 """The dataset of `init_expert`."""
 CLONING_RATE, CLONING_BATCH = 3e-3, 256
@@ -103,6 +109,9 @@ def train(config: TrainConfig, folder: str | Path, *, progress: Progress | None 
     }
     if trained_on is not task:
         plain["shaped_fingerprint"] = fingerprint(trained_on)
+    half = config.precision == "bfloat16" and config.device == "cpu"
+    if half and not torch.cpu._is_avx512_bf16_supported():
+        raise failure("PD640", "`precision`: this processor does not compute in bfloat16")
     run = open_run(folder, KIND, plain)
     with lock_folder(run.path), _own_random_numbers(config.threads):
         write_json(run.path / ASKED, config.as_json())
@@ -130,6 +139,7 @@ def train(config: TrainConfig, folder: str | Path, *, progress: Progress | None 
                 held_out = TaskProgram(task, config.eval_split, program.simulator)
             played = -1 if checkpoint is None else step
             keeper = _Keeper(run, learner, metrics, progress, held_out, played)
+            began = time.perf_counter()
             try:
                 learner.model.learn(config.steps - step, keeper, reset_num_timesteps=checkpoint is None)
             except KeyboardInterrupt:
@@ -137,6 +147,8 @@ def train(config: TrainConfig, folder: str | Path, *, progress: Progress | None 
                 if keeper.latest is not None and keeper.latest[0]:
                     run.save_checkpoint(*keeper.latest)
                 raise
+            passed = {"interactions": learner.step - step, "seconds": time.perf_counter() - began}
+            write_json(run.path / SPEED, {**passed, **learner.seconds})
             keeper.play_held_out(learner.step)
             run.save_checkpoint(learner.step, learner.state())
     return run
@@ -157,14 +169,6 @@ class _Rollout(RolloutBuffer):
         if self.see is not None:
             obs = self.see.count(torch.as_tensor(obs, device=self.device)).cpu().numpy()
         super().add(obs, *rest)
-
-    def to_torch(self, array: NDArray[Any], copy: bool = True) -> torch.Tensor:
-        """A tensor of a batch, which is a copy already."""
-        return torch.as_tensor(array, device=self.device)
-
-    def _get_samples(self, batch_inds: NDArray[Any], env: Any = None) -> Any:
-        batch: Any = super()._get_samples(batch_inds)
-        return batch if self.see is None else batch._replace(observations=Counts(batch.observations))
 
 
 class _Learner:
@@ -203,10 +207,22 @@ class _Learner:
                 normalize_advantage=config.normalize in ("advantage", "both"),
                 policy_kwargs=how,
                 rollout_buffer_class=_Rollout,
-                rollout_buffer_kwargs={"see": see if isinstance(see, Patches) and see.counts_all else None},
+                rollout_buffer_kwargs={"see": see if isinstance(see, Patches) and see.one_channel else None},
                 device=config.device,
                 seed=config.seed,
             )
+
+        compute_in(config.precision, self.model.policy)
+        self.seconds = {"env": 0.0, "policy": 0.0, "update": 0.0}
+        methods = (self.worlds, "step_wait"), (self.model.policy, "forward"), (self.model, "train")
+        for part, (owner, name) in zip(self.seconds, methods, strict=True):
+            setattr(owner, name, partial(self._timed, part, getattr(owner, name)))
+
+    def _timed(self, part: str, method: Callable[..., Any], *arguments: Any) -> Any:
+        began = time.perf_counter()
+        result = method(*arguments)
+        self.seconds[part] += time.perf_counter() - began
+        return result
 
     @property
     def step(self) -> int:
@@ -337,11 +353,8 @@ def _returns(dataset: Dataset, gamma: float) -> NDArray[np.float32]:
     parts = []
     for number in range(len(dataset)):
         reward = dataset.episode(number).reward.double().numpy()
-        total, returns = 0.0, np.empty(len(reward), np.float32)
-        for step in reversed(range(len(reward))):
-            total = reward[step] + gamma * total
-            returns[step] = total
-        parts.append(returns)
+        returns = [*accumulate(reward[::-1], lambda later, now: now + gamma * later)]
+        parts.append(np.asarray(returns[::-1], np.float32))
     return np.concatenate(parts)
 
 
@@ -454,9 +467,18 @@ def _own_random_numbers(threads: int) -> Iterator[None]:
     before, used, checks = _random_state(), torch.get_num_threads(), Distribution._validate_args
     torch.set_num_threads(threads)
     Distribution.set_default_validate_args(False)
+    _keep_memory(1 << 30)
     try:
         yield
     finally:
+        _keep_memory(1 << 25)
         Distribution.set_default_validate_args(checks)
         torch.set_num_threads(used)
         _set_random_state(before)
+
+
+def _keep_memory(size: int) -> None:
+    """Let glibc keep so many free bytes: tensors of an update are as large each time, and new pages are slow."""
+    library: Any = ctypes.CDLL(None) if sys.platform == "linux" else None
+    for parameter in (-1, -3) if hasattr(library, "mallopt") else ():  # M_TRIM_THRESHOLD, M_MMAP_THRESHOLD
+        library.mallopt(parameter, size)

@@ -12,15 +12,16 @@ import pytest
 import torch
 from gymnasium.spaces import MultiDiscrete
 from PIL import Image
+from torch import nn
 
 from powderdsl.diagnostics import CompileError
 from powderdsl.envs.actions import random_policy
-from powderdsl.envs.features import Counts, Patches
+from powderdsl.envs.features import Patches
 from powderdsl.envs.tensor_env import TensorEnv, observation_of
 from powderdsl.experiments.runs import RunFolder
 from powderdsl.rl import evaluate, load_policy, train
 from powderdsl.rl.evaluation import HAND, Film, film, play
-from powderdsl.rl.policies import policy_of
+from powderdsl.rl.policies import Residual, policy_of
 from powderdsl.simulation.draw import OUTLINES
 from powderdsl.simulation.simulator import World
 from powderdsl.system.random import action_keys
@@ -47,7 +48,7 @@ def test_a_policy_that_only_acts_imports_no_compiler(run: RunFolder) -> None:
     """The first optimizer of a process imports `torch._dynamo`, which takes a second."""
     program = f"""
 import sys
-from powderdsl.envs.features import Counts, Patches
+from powderdsl.envs.features import Patches
 from powderdsl.envs.tensor_env import TensorEnv
 from powderdsl.rl import load_policy
 from powderdsl.tasks.episodes import compile_task
@@ -60,6 +61,16 @@ print("torch._dynamo" in sys.modules)
     assert found.stdout == "False\n", found.stderr
 
 
+def test_a_residual_is_the_sum_of_its_parts() -> None:
+    torch.manual_seed(0)
+    block, mean = nn.Conv2d(4, 4, 3, padding=2, dilation=2).double(), nn.Linear(4, 4).double()
+    x = torch.rand(2, 4, 5, 6, dtype=torch.double, requires_grad=True)
+    parts = (*block.parameters(), *mean.parameters())
+    expected = x + (block(x) + mean(x.mean((2, 3)))[:, :, None, None]).relu()
+    assert torch.allclose(Residual.apply(x, *parts, (2, 2)), expected, rtol=1e-12)
+    assert torch.autograd.gradcheck(lambda *given: Residual.apply(*given, (2, 2)), (x, *parts))
+
+
 @pytest.mark.parametrize("network", ["small", "fcn"])
 def test_observations_are_counted_once_for_all_epochs(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, network: str
@@ -69,7 +80,7 @@ def test_observations_are_counted_once_for_all_epochs(
     kind, how = policy_of(config, env)
     policy = kind(env.observation.space, MultiDiscrete(np.array(env.action_nvec)), lambda _: 1e-3, **how)
     observed, actions = env.reset(seed=0)[0], torch.tensor([[1, 0, 1, 0, 0]] * 4)
-    counts = Counts(next(one for one in policy.modules() if isinstance(one, Patches)).count(observed).byte())
+    counts = next(one for one in policy.modules() if isinstance(one, Patches)).count(observed).byte()
     pairs = zip(
         policy.evaluate_actions(counts, actions), policy.evaluate_actions(observed, actions), strict=True
     )

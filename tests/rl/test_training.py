@@ -42,6 +42,7 @@ OTHER = {
     "small": {"network": "small"},
     "paper": {"network": "paper"},
     "fcn": {"network": "fcn", "eval_every": 64, "eval_episodes": 3},
+    "bfloat16": {"network": "fcn", "precision": "bfloat16"},
     "frames": {"frames": 3, "normalize": "both", "target_kl": 0.01, "eval_every": 1, "eval_episodes": 3},
 }
 
@@ -52,6 +53,8 @@ def test_a_run_in_parts_is_a_run_at_once(task: Path, tmp_path: Path, name: str) 
         if step >= 76:
             raise KeyboardInterrupt
 
+    if name == "bfloat16" and not torch.cpu._is_avx512_bf16_supported():
+        pytest.skip("the processor has no bfloat16")
     config, folder = quick(task, **OTHER[name]), tmp_path / "parts"
     whole = train(config, tmp_path / "whole")
     train(replace(config, steps=10), folder)
@@ -109,6 +112,23 @@ def test_a_run_that_is_killed_ends_as_if_it_had_not_been(task: Path, tmp_path: P
     assert run.checkpoint().step == whole.checkpoint().step == 640
     assert same(lasting(run), lasting(whole))
     assert logged(run) == logged(whole)
+
+
+@pytest.mark.parametrize("network", ["small", "fcn"])
+def test_bfloat16_is_for_processors_that_have_it_and_nearly_as_precise(
+    task: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, network: str
+) -> None:
+    monkeypatch.setattr(torch.cpu, "_is_avx512_bf16_supported", lambda: False)
+    config = quick(task, steps=32, network=network, precision="bfloat16")
+    assert "`precision`" in refusal(train, config, tmp_path / "run")[0].message
+    monkeypatch.setattr(torch.cpu, "_is_avx512_bf16_supported", lambda: True)  # torch computes in it anyway
+    runs = [train(one, tmp_path / one.precision) for one in (config, replace(config, precision="float32"))]
+    assert "precision" not in runs[1].config  # such as those of before
+    states = [run.checkpoint().state["policy"] for run in runs]
+    assert {one.dtype for one in states[0].values() if one.is_floating_point()} == {torch.float32}
+    assert not same(*states)
+    apart = [(one - states[1][name]).abs().max().item() for name, one in states[0].items()]
+    assert max(apart) < 0.02
 
 
 def test_another_configuration_is_refused(task: Path, tmp_path: Path) -> None:

@@ -10,7 +10,7 @@ import click
 
 from powderdsl.cli import options as opt
 from powderdsl.cli.exits import BadInput
-from powderdsl.cli.output import progress
+from powderdsl.cli.output import print_json, progress
 from powderdsl.rl.config import PRESETS, TrainConfig, from_json, preset
 from powderdsl.system.reading import read_json
 
@@ -30,7 +30,8 @@ from powderdsl.system.reading import read_json
 @opt.settings_of(TrainConfig, PRESETS, checkpoint_minutes="save-every")
 @opt.task_options
 @opt.backend(None, "Backend that runs the rules.  [default: auto]")
-def command(task: str | None, folder: Path | None, resume: Path | None, **values: Any) -> None:
+@opt.option("--json", bool, "One JSON object instead of text.", to="as_json")
+def command(task: str | None, folder: Path | None, resume: Path | None, as_json: bool, **values: Any) -> None:
     """Train an agent on TASK with PPO: a shipped task's name, or a task's file.
 
     The same command again, or --resume DIR, continues where a run was interrupted; more --steps continue with one that is
@@ -39,11 +40,11 @@ def command(task: str | None, folder: Path | None, resume: Path | None, **values
     if resume is not None:
         if task is not None or folder is not None:
             raise BadInput("--resume goes without TASK and --run: the run knows its task")
-        config, folder = _config_of(resume, values), resume
+        config, folder = _continued(resume, values)
     else:
         config = new_config({**values, "task": task})
         folder = folder or Path("runs") / f"{Path(config.task).stem}-seed{config.seed}"
-    from powderdsl.rl.training import train
+    from powderdsl.rl.training import SPEED, train
 
     rollout = config.envs * config.rollout
     with progress(Path(config.task).stem, config.steps, lines=True, resumes=folder, rounds=rollout) as show:
@@ -52,8 +53,14 @@ def command(task: str | None, folder: Path | None, resume: Path | None, **values
             show(min(step, config.steps), "" if mean is None else f"return {mean:.3f}")
 
         run = train(config, folder, progress=tell)
-    checkpoint = run.checkpoint()
-    click.echo(f"{folder}: {checkpoint.step:,} interactions")
+    step, speed = run.checkpoint().step, read_json(run.path / SPEED) or {}
+    if as_json:
+        return print_json({"run": str(folder), "step": step, "speed": speed})
+    click.echo(f"{folder}: {step:,} interactions")
+    if speed:
+        seconds, parts = speed["seconds"], ("env", "policy", "update")
+        shares = ", ".join(f"{part} {speed[part] / seconds:.0%}" for part in parts)
+        click.echo(f"{speed['interactions'] / seconds:,.0f} a second: {shares}")
     click.echo(f"powderdsl evaluate {folder}; powderdsl watch {folder}", err=True)
 
 
@@ -75,8 +82,8 @@ def new_config(values: Mapping[str, Any]) -> TrainConfig:
     return preset(values["preset_name"] or usual, name, **settings, **what)
 
 
-def _config_of(folder: Path, values: Mapping[str, Any]) -> TrainConfig:
-    """The settings of a run, with those changed that may change."""
+def _continued(folder: Path, values: Mapping[str, Any]) -> tuple[TrainConfig, Path]:
+    """The settings of a run, with those changed that may change, and its folder."""
     from powderdsl.experiments.runs import find_run
     from powderdsl.rl.config import HOW
     from powderdsl.rl.policies import config_of
@@ -88,4 +95,4 @@ def _config_of(folder: Path, values: Mapping[str, Any]) -> TrainConfig:
     run = find_run(folder, KIND)
     latest = read_json(run.path / ASKED) or {}
     how = {name: latest[name] for name in HOW if name in latest}
-    return from_json({**config_of(run).as_json(), **how, **settings})
+    return from_json({**config_of(run).as_json(), **how, **settings}), run.path
