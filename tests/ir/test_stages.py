@@ -14,7 +14,6 @@ from powderdsl.ir.ops import (
     FLAG,
     REAL,
     Graph,
-    InvalidIR,
     Node,
     PassGraph,
     Program,
@@ -22,10 +21,10 @@ from powderdsl.ir.ops import (
     SubstepGraph,
     integer,
     nodes_of,
-    verify,
 )
 from powderdsl.ir.stages import PIPELINE, run_passes
 from powderdsl.ir.text import print_program
+from tests.ir.verify import InvalidIR, verify
 
 GOLDEN = Path(__file__).parent / "golden"
 
@@ -83,13 +82,13 @@ def program_of(name: str, folder: Path) -> Program:
 def test_golden_ir(name: str, tmp_path: Path, golden) -> None:  # type: ignore[no-untyped-def]
     program = program_of(name, tmp_path)
     planes = lower_bits(run_passes(program))
-    verify(planes, "bits")
     assert {node.type.name for pass_ in planes.passes for node in nodes_of(pass_)} <= {"flag", "real"}
     stages = {"lower": program}
     stages |= {stage.name: run_passes(program, until=stage.name) for stage in PIPELINE}
     stages["bits"] = planes
     text = before = ""
     for stage, after in stages.items():
+        verify(after, stage)
         printed = print_program(after)
         text += f"== {stage}\n" + ("as before\n" if printed == before else printed)
         before = printed

@@ -16,6 +16,7 @@ from powderdsl.model.types import Ruleset
 from powderdsl.prover.equality import Side, _differ
 from powderdsl.prover.solver import OutOfWork
 from powderdsl.prover.symbolic import Budget, Names, Undecided, deep_recursion
+from tests.ir.verify import verify
 
 SECONDS = 60.0
 """Work for one pass and stage."""
@@ -30,11 +31,13 @@ class Comparison(NamedTuple):
 
 
 def programs(ruleset: Ruleset) -> Mapping[str, Program]:
-    """The program after lowering, and after each stage."""
+    """The program after lowering, and after each stage, verified."""
     after = {"lower": lower_ruleset(ruleset)}
     program = after["lower"]
     for stage in stages.PIPELINE:
         program = after[stage.name] = replace(program, passes=tuple(map(stage.run, program.passes)))
+    for name, program in after.items():
+        verify(program, name)
     return after
 
 

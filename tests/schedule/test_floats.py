@@ -7,9 +7,10 @@ from dataclasses import replace
 import pytest
 
 from powderdsl.compiler import load
-from powderdsl.ir.ops import REAL, InvalidIR
+from powderdsl.ir.ops import REAL
 from powderdsl.schedule.stages import CPU, plan
 from powderdsl.schedule.types import Compute, Move, Statement, Sweeps, flat
+from tests.ir.verify import InvalidIR
 from tests.schedule.test_stages import packed_passes, run_stages
 from tests.schedule.verify import verify
 from tests.semantics.texts import load_text

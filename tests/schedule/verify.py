@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from powderdsl.ir.ops import FLAG, OPS, REAL, InvalidIR, Node, Type, demand, ordered
+from powderdsl.ir.ops import FLAG, OPS, REAL, Node, Type, ordered
 from powderdsl.schedule.types import (
     ANSWER,
     Compute,
@@ -20,6 +20,7 @@ from powderdsl.schedule.types import (
     loaded,
     read_elsewhere,
 )
+from tests.ir.verify import InvalidIR, demand
 
 SCHEDULE_OPS = {"load", "below_param", "any", "some", "when", "led", "live", "present"}
 """Operations that only schedules have."""
