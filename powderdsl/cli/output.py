@@ -7,7 +7,6 @@ import sys
 import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
-from datetime import timedelta
 from pathlib import Path
 from shlex import quote
 from typing import IO, TYPE_CHECKING, Any
@@ -58,19 +57,16 @@ Show = Callable[..., None]
 
 
 @contextmanager
-def progress(
-    title: str, total: float, *, lines: bool = False, resumes: Path | None = None, rounds: int = 0
-) -> Iterator[Show]:
+def progress(title: str, total: float, *, lines: bool = False, resumes: Path | None = None) -> Iterator[Show]:
     """A bar that disappears at the end; other output appears above it.
 
     Args:
         total: the final value of `done`.
         lines: where stderr is not a terminal, write a line every `SECONDS`; otherwise nothing.
         resumes: the folder in which the same command continues after an interruption; a line then says so.
-        rounds: the work between two pauses, such as updates of a network, that the remaining time has to count.
     """
     try:
-        with _bar(title, total, lines, rounds) as show:
+        with _bar(title, total, lines) as show:
             yield show
     except KeyboardInterrupt:
         if resumes is not None:
@@ -79,7 +75,7 @@ def progress(
 
 
 @contextmanager
-def _bar(title: str, total: float, lines: bool, rounds: int) -> Iterator[Show]:
+def _bar(title: str, total: float, lines: bool) -> Iterator[Show]:
     if not sys.stderr.isatty() or os.environ.get("TERM") == "dumb":
         last = time.monotonic()
 
@@ -92,51 +88,21 @@ def _bar(title: str, total: float, lines: bool, rounds: int) -> Iterator[Show]:
         yield show_line
         return
     from rich.console import Console
-    from rich.progress import (
-        BarColumn,
-        MofNCompleteColumn,
-        Progress,
-        ProgressColumn,
-        TextColumn,
-        TimeRemainingColumn,
-    )
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-    clock: ProgressColumn = TimeRemainingColumn(elapsed_when_finished=True)
-    remaining = Remaining(total, rounds)
-    if rounds:
-        clock = TextColumn("{task.fields[left]}")
+    clock = TimeRemainingColumn(elapsed_when_finished=True)
     columns = (TextColumn("{task.description}", markup=False), BarColumn(), MofNCompleteColumn(), clock)
     console = Console(file=raw_stream(sys.stderr), highlight=False, soft_wrap=True)
     shown = TextColumn("{task.fields[words]}", markup=False)
     # Inside, stderr is rich's, which prints above the bar: what goes there is escaped as well.
-    with Progress(*columns, shown, console=console, transient=True) as bar, printable_streams():
-        task = bar.add_task(printable(title), total=total, words="", left="")
+    # The pace of minutes counts pauses too, such as updates of a network.
+    with (
+        Progress(*columns, shown, console=console, transient=True, speed_estimate_period=600) as bar,
+        printable_streams(),
+    ):
+        task = bar.add_task(printable(title), total=total, words="")
 
         def show(done: float, words: str = "") -> None:
-            left = remaining.after(done, time.monotonic()) if rounds else ""
-            bar.update(task, completed=done, words=printable(words), left=left)
+            bar.update(task, completed=done, words=printable(words))
 
         yield show
-
-
-class Remaining:
-    """The time that work takes that pauses after every `rounds` of it, judged by whole rounds."""
-
-    def __init__(self, total: float, rounds: int):
-        self.total, self.rounds = total, rounds
-        self.start: tuple[float, float] | None = None
-        self.pace = 0.0
-        """Seconds for each unit of work, pauses included; 0 before the first pause is over."""
-        self.whole = 0.0
-
-    def after(self, done: float, now: float) -> str:
-        """The remaining time as ``h:mm:ss``, when `done` is done at the time `now`, in seconds."""
-        if self.start is None:
-            self.start = done, now
-        first, began = self.start
-        whole = (done - first) // self.rounds * self.rounds
-        if whole > self.whole:
-            self.whole, self.pace = whole, (now - began) / whole
-        if not self.pace:
-            return "-:--:--"
-        return str(timedelta(seconds=round(self.pace * (self.total - done))))

@@ -7,8 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from powderdsl.cli.commands.study import commands
-from powderdsl.cli.study.checks import check_study
+from powderdsl.cli.commands.study import check_study, commands
 from powderdsl.diagnostics import CompileError, Diagnostic, Reporter, Source
 from powderdsl.experiments.studies.study import Study, load_study, read_study, shipped_studies
 from tests.cli.commands import powderdsl

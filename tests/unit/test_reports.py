@@ -6,7 +6,6 @@ import json
 from dataclasses import dataclass
 from pathlib import Path
 
-from powderdsl.cli.output import Remaining
 from powderdsl.system.reports import Painted, as_json, table
 
 
@@ -35,13 +34,3 @@ def test_only_painted_cells_have_terminal_codes():
 def test_dataclasses_are_objects():
     data = json.loads(as_json([Row("ice", frozenset({"b", "a"}), Path("x.yaml"))]))
     assert data == [{"from": "ice", "seen": ["a", "b"], "file": "x.yaml"}]
-
-
-def test_the_remaining_time_counts_the_pauses_between_rounds():
-    """Rounds of 100 take 1 s, and the pause after each 9 s."""
-    remaining = Remaining(1000, 100)
-    assert remaining.after(200, 5.0) == "-:--:--"  # a run that goes on
-    assert remaining.after(299, 5.9) == "-:--:--"
-    assert remaining.after(300, 15.0) == "0:01:10"
-    assert remaining.after(400, 25.0) == "0:01:00"
-    assert remaining.after(450, 25.5) == "0:00:55"

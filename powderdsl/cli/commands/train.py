@@ -46,8 +46,7 @@ def command(task: str | None, folder: Path | None, resume: Path | None, as_json:
         folder = folder or Path("runs") / f"{Path(config.task).stem}-seed{config.seed}"
     from powderdsl.rl.training import SPEED, train
 
-    rollout = config.envs * config.rollout
-    with progress(Path(config.task).stem, config.steps, lines=True, resumes=folder, rounds=rollout) as show:
+    with progress(Path(config.task).stem, config.steps, lines=True, resumes=folder) as show:
 
         def tell(step: int, mean: float | None) -> None:
             show(min(step, config.steps), "" if mean is None else f"return {mean:.3f}")
