@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 
 from powderdsl.analysis.changes import facts_of
-from powderdsl.analysis.ledger import TREND_BREAKS, Ledger, NotProven, Proven, Verdict
+from powderdsl.analysis.ledger import TREND_BREAKS, Ledger, Proven, Verdict
 from powderdsl.model.logic.satisfy import satisfiable
 from powderdsl.model.types import (
     Assign,
@@ -26,47 +26,36 @@ from powderdsl.model.types import (
 )
 
 
-def prove(claim: Claim, ruleset: Ruleset, ledger: Ledger, without: frozenset[int] = frozenset()) -> Verdict:
-    """Decide if the claim holds in all worlds, or in worlds that start without some elements.
-
-    `NotProven` does not disprove it.
-    """
+def prove(claim: Claim, ruleset: Ruleset, ledger: Ledger, without: frozenset[int]) -> Proven | None:
+    """Return the proof that the claim holds in all worlds that start without some elements; None if none is found."""
+    verdicts: list[Verdict] = []
     match claim:
         case Unchanging():
             verdicts = [ledger.unchanged(name) for name in _names(ruleset, claim.ids)]
-            return next((v for v in verdicts if isinstance(v, NotProven)), verdicts[0])
         case Total() if claim.ids is not None:
             counted = _names(ruleset, claim.ids)
-            verdict = ledger.keeps(counted, claim.trend)
-            if verdict or not without:
-                return verdict
-            return _prove_count(claim.trend, set(counted), ledger, _names(ruleset, without))
+            verdicts = [ledger.keeps(counted, claim.trend)]
+            if without and not all(verdicts):
+                return _prove_count(claim.trend, set(counted), ledger, _names(ruleset, without))
         case Bounded():
             prop = ruleset.property(claim.field)
             if prop is not None and not prop.stored:
                 return Proven(f"no rule changes `{claim.field}`")
-            return ledger.within(claim.field, claim.lo, claim.hi)
-        case Local():
-            reach = horizon(ruleset)
-            if reach <= claim.radius:
-                return Proven(f"what a cell holds depends on nothing beyond {reach} cells")
-            return NotProven(f"together the rules of a step might see {reach} cells far")
-        case Never():
-            if not satisfiable(facts_of(ruleset), [(claim.condition, (0, 0))]):
-                return Proven("no cell can fulfill the condition", by="search")
-    return NotProven("no proof is known for statements of this kind")
+            verdicts = [ledger.within(claim.field, claim.lo, claim.hi)]
+        case Local() if (reach := horizon(ruleset)) <= claim.radius:
+            return Proven(f"what a cell holds depends on nothing beyond {reach} cells")
+        case Never() if not satisfiable(facts_of(ruleset), [(claim.condition, (0, 0))]):
+            return Proven("no cell can fulfill the condition", by="search")
+    proofs = [verdict for verdict in verdicts if isinstance(verdict, Proven)]
+    return proofs[0] if proofs and len(proofs) == len(verdicts) else None
 
 
-def _prove_count(trend: str, counted: set[str], ledger: Ledger, without: list[str]) -> Verdict:
-    """The ledger's verdict on a count in worlds without some elements: rules that need these cannot happen."""
+def _prove_count(trend: str, counted: set[str], ledger: Ledger, without: list[str]) -> Proven | None:
+    """The proof for a count in worlds without some elements: rules that need these cannot happen."""
     cells = frozenset(ledger.reach(name for name in ledger.elements if name not in without))
-    lines = [
-        line
-        for line, before, after in ledger.possible(cells)
-        if TREND_BREAKS[trend](after in counted, before in counted)
-    ]
-    if lines:
-        return NotProven("some rule may change the number", tuple(dict.fromkeys(lines)))
+    changes = ((before in counted, after in counted) for _, before, after in ledger.possible(cells))
+    if any(TREND_BREAKS[trend](after, before) for before, after in changes):
+        return None
     return Proven("no rule that can happen in such worlds changes the number so")
 
 

@@ -10,7 +10,7 @@ from math import inf
 from time import monotonic
 from typing import Any, ClassVar, Self
 
-from powderdsl.analysis.ledger import Proven, ledger
+from powderdsl.analysis.ledger import ledger
 from powderdsl.analysis.proofs import prove
 from powderdsl.arrays import np
 from powderdsl.diagnostics import Diagnostic, Label, Reporter
@@ -35,7 +35,7 @@ from powderdsl.testing.properties.breaks import (
 )
 from powderdsl.testing.properties.models import starts
 from powderdsl.testing.properties.outcomes import Counterexample, Property, Result, counterexample_lines
-from powderdsl.testing.properties.running import LARGE, Oracle, Runs, join_starts, random_samples
+from powderdsl.testing.properties.running import LARGE, Oracle, Runs, State, join_starts, random_samples
 
 AUTOMATIC = "automatic"
 
@@ -93,12 +93,12 @@ class InvariantSearch:
             if prop.owner == AUTOMATIC:
                 search.trials += [] if declared_only else [Result(prop)]
                 continue
-            verdict = prove(prop.claim, runner.ruleset, entries, prop.without)  # type: ignore[arg-type]
-            if isinstance(verdict, Proven):
-                condition = f", given {verdict.given}" if verdict.given else ""
-                search.trials.append(Result(prop, verdict.reason + condition, verdict.by))
-            else:
+            proof = prove(prop.claim, runner.ruleset, entries, prop.without)  # type: ignore[arg-type]
+            if proof is None:
                 search.trials.append(Result(prop))
+            else:
+                condition = f", given {proof.given}" if proof.given else ""
+                search.trials.append(Result(prop, proof.reason + condition, proof.by))
         search.prove()
         return search
 
@@ -143,32 +143,24 @@ class InvariantSearch:
             self.try_sample(sample, STEPS[number % len(STEPS)])
 
     def try_sample(self, sample: Start, steps: int) -> None:
-        """Check all properties that are not broken yet on some worlds."""
-        waiting: dict[frozenset[int], list[Result]] = {}
+        """Check all properties that are not broken yet on some worlds. Those that start and run alike share a run."""
+        ruleset, runs = self.runner.ruleset, dict[frozenset[int], list[State]]()
         for trial in self.undecided:
-            waiting.setdefault(trial.prop.without, []).append(trial)
-        for without, trials in waiting.items():
-            self._try_without(trials, sample.without(without, self.runner.ruleset), steps)
-
-    def _try_without(self, trials: list[Result], sample: Start, steps: int) -> None:
-        """Properties that demand the same of a start world: one run does for most of them."""
-        shared = [
-            t for t in trials if not is_paired(t.prop.claim) and steps_for(t.prop.claim, steps) == steps
-        ]
-        if shared:
-            states = self.runner.states(sample, steps)
-            for trial in shared:
-                self._note(trial, sample, find_breaks(trial.prop.claim, self.runner.ruleset, sample, states))
-        for trial in trials:
-            if trial in shared or (isinstance(trial.prop.claim, Alike) and isinstance(self.runner, Oracle)):
-                continue  # the oracle takes too long for thousands of worlds
-            most = self.few.get(type(trial.prop.claim))
-            large = isinstance(trial.prop.claim, Agreement) and sample.shape == LARGE
-            if most is not None and trial.batches >= most and not large:
+            claim, without = trial.prop.claim, trial.prop.without
+            start, count = sample.without(without, ruleset), steps_for(claim, steps)
+            if not is_paired(claim) and count == steps:
+                if without not in runs:
+                    runs[without] = self.runner.states(start, steps)
+                self._note(trial, start, find_breaks(claim, ruleset, start, runs[without]))
                 continue
-            some = sample.select(slice(0, 4)) if isinstance(trial.prop.claim, Alike) else sample
-            ran = steps_for(trial.prop.claim, min(steps, 3))
-            self._note(trial, some, breaks(trial.prop.claim, self.runner, some, ran))
+            done = trial.batches >= self.few.get(type(claim), inf)
+            if done and not (isinstance(claim, Agreement) and start.shape == LARGE):
+                continue
+            if isinstance(claim, Alike):
+                if isinstance(self.runner, Oracle):
+                    continue  # it takes too long for thousands of worlds
+                start = start.select(slice(0, 4))
+            self._note(trial, start, breaks(claim, self.runner, start, steps_for(claim, min(steps, 3))))
 
     def _note(self, trial: Result, sample: Start, breaks: Breaks) -> None:
         trial.batches += 1
