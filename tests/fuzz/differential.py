@@ -34,8 +34,8 @@ State = Mapping[str, Any]
 
 ORACLE = "reference"
 
-WIDTHS = (7, 31, 32, 33, 63, 64, 64, 64, 65, 97, 128, 130)
-"""Columns of wide worlds: the borders of words of 32 and 64 columns, more words than one, and the width of most worlds."""
+WIDTHS = (7, 8, 16, 31, 32, 33, 63, 64, 64, 64, 65, 97, 128, 130)
+"""Columns of wide worlds: the words of native code, their borders, more words than one, and the width of most worlds."""
 
 STRIPS = 8
 """Strips that native code cuts a world into, unless its words are narrow; it does so if they have equally many rows."""

@@ -52,7 +52,7 @@ static void close_plane(const Context& c, Plane* p) {  // nothing beyond the wid
   p->zero = !any(some);
 }
 // Masks of choices, lane by lane: [LANES][height][words][c.masks], so that a lane finds the words of all masks side by side.
-ALWAYS void turn(const V* in, V* out) {  // TURN vectors; squares of as many words
+ALWAYS void turn(const V* in, V* out, int lanes) {  // TURN vectors; squares of as many words
 #if VECTOR == 64
   V number;
   for (int l = 0; l < LANES; l++) number[l] = l;
@@ -71,7 +71,7 @@ ALWAYS void turn(const V* in, V* out) {  // TURN vectors; squares of as many wor
   _Pragma("GCC unroll 16") for (int i = 0; i < TURN; i++) out[i] = rows[i];
 #else
   for (int i = 0; i < TURN; i++)
-    for (int l = 0; l < LANES; l++) out[l % TURN][l - l % TURN + i] = in[i][l];
+    for (int l = 0; l < lanes; l++) out[l % TURN][l - l % TURN + i] = in[i][l];
 #endif
 }
 OUTLINE void turn_masks(Context& c, const Plane* const* planes, int count, int place) {
@@ -80,7 +80,7 @@ OUTLINE void turn_masks(Context& c, const Plane* const* planes, int count, int p
     for (int from = 0; from < count; from += TURN) {
       V in[TURN], out[TURN];
       for (int k = 0; k < TURN; k++) in[k] = from + k < count ? planes[from + k]->data[i] : splat(0);
-      turn(in, out);
+      turn(in, out, c.lanes);
       for (int l = 0; l < c.lanes; l++)
         *(Turned*)(c.turned + ((size_t)l * cells + i) * c.masks + place + from) = ((const Turned*)&out[l % TURN])[l / TURN];
     }
@@ -89,6 +89,8 @@ ALWAYS const Word* turned_row(const Context& c, int line) { return c.turned + (s
 ALWAYS u32 turned_bits(Turned a) {  // a bit for each mask that has any
 #if VECTOR == 64 && WIDTH == 16
   return _mm256_test_epi16_mask((__m256i)a, (__m256i)a);
+#elif VECTOR == 32 && WIDTH == 8
+  return (u32)_mm_movemask_epi8((__m128i)(a != 0));
 #else
   return lanes_of((V)a);
 #endif

@@ -39,10 +39,10 @@ class NativeSource(NamedTuple):
 def known_width(width: int) -> int:
     """The width that a library for grids of this width is compiled for; 0 if it takes any width.
 
-    Rows of whole words have a library for each width: words have 64 columns, or all columns of 16 or 32. All other widths
-    share one.
+    Rows of whole words have a library for each width: words have 64 columns, or all columns of 8, 16 or 32. All other
+    widths share one.
     """
-    return width if width in (16, 32) or width % 64 == 0 else 0
+    return width if width in (8, 16, 32) or width % 64 == 0 else 0
 
 
 @collection_paused()

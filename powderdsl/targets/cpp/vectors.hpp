@@ -1,6 +1,6 @@
 // The library that generated code builds on. One group = LANES worlds side by side: lane l of every vector is world l.
 // Or, in strips: fewer worlds, each cut into strips of as many rows, one below the other, in lanes side by side.
-// A plane is one bit a cell: 64 columns in a word, or as many as worlds have if those are 16 or 32; a vector holds the same
+// A plane is one bit a cell: 64 columns in a word, or as many as worlds have if those are 8, 16 or 32; a vector holds the same
 // word of all worlds of the group.
 // Reals lie by world and row, with a halo of wrapped columns on both sides. Nothing here knows any rule.
 #include <algorithm>
@@ -22,8 +22,9 @@
 
 typedef uint64_t u64;
 typedef uint32_t u32;
-// A vector is a register of the processor: compilers keep wider ones in memory, which takes six times as long.
-#if defined(__AVX512BW__)
+// A vector is a register of the processor: compilers keep wider ones in memory, which takes six times as long. Where words
+// have 8 bits, a narrower one, so that it has no more floats than a word has columns.
+#if defined(__AVX512BW__) && WIDTH != 8
 #define VECTOR 64
 #define NUMBERS {0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15}
 #elif defined(__AVX2__)
@@ -35,7 +36,9 @@ typedef uint32_t u32;
 #endif
 // WIDTH is the number of columns if the library is for grids of that width alone, else 0. Most work is loops over the words
 // of a row and over columns: where their number is known, they cost a quarter less and compile faster.
-#if WIDTH == 16
+#if WIDTH == 8
+typedef uint8_t Word;
+#elif WIDTH == 16
 typedef uint16_t Word;
 #elif WIDTH == 32
 typedef u32 Word;
@@ -78,6 +81,8 @@ ALWAYS u32 lanes_of(V a) {  // a bit for each world that has any
   return _mm512_test_epi32_mask((__m512i)a, (__m512i)a);
 #elif VECTOR == 64
   return _mm512_test_epi64_mask((__m512i)a, (__m512i)a);
+#elif VECTOR == 32 && WIDTH == 8
+  return (u32)_mm256_movemask_epi8((__m256i)(a != 0));
 #elif VECTOR == 32 && WIDTH == 16
   const __m256i some = (__m256i)(a != 0);
   return (u32)_mm_movemask_epi8(_mm_packs_epi16(_mm256_castsi256_si128(some), _mm256_extracti128_si256(some, 1)));
@@ -96,9 +101,15 @@ ALWAYS bool any_word(const V* row, int words) {
   for (int w = 1; w < words; w++) some |= row[w];
   return any(some);
 }
-// Compilers refuse to shift words of 16 bits by an int.
+// Compilers refuse to shift words of 16 bits by an int, and shift words of 8 bits one by one.
+#if WIDTH == 8
+typedef uint16_t Pair __attribute__((vector_size(VECTOR), may_alias));
+ALWAYS V right(V x, int by) { return (V)((Pair)x >> (uint16_t)by) & splat(FULL >> by); }
+ALWAYS V left(V x, int by) { return (V)((Pair)x << (uint16_t)by) & splat(FULL << by); }
+#else
 ALWAYS V right(V x, int by) { return x >> (Word)by; }
 ALWAYS V left(V x, int by) { return x << (Word)by; }
+#endif
 ALWAYS V rotated(V x, int by) {  // each word to the right, by less than its width
 #if VECTOR == 64 && WIDTH == 16 && defined(__AVX512VBMI2__)
   return (V)_mm512_shrdv_epi16((__m512i)x, (__m512i)x, (__m512i)splat(by));
@@ -125,7 +136,7 @@ ALWAYS V two_of(V a, V which, V b) {  // words of a, then of b, by their numbers
 
 // The flags of a chunk as bits, and back as a choice between two vectors.
 ALWAYS u32 bits_of(I m) {
-#if defined(__AVX512DQ__)
+#if VECTOR == 64 && defined(__AVX512DQ__)
   return _mm512_movepi32_mask((__m512i)m);
 #elif VECTOR == 64
   return _mm512_cmplt_epi32_mask((__m512i)m, _mm512_setzero_si512());
