@@ -46,6 +46,15 @@ def test_show_lists_elements_reactions_passes_and_parameters():
     assert few[few.index("Reactions") + 1] == "  none"
 
 
+def test_show_says_what_a_step_of_a_task_runs(tmp_path):
+    pytest.importorskip("torch")
+    assert "step: one call of native code" in powderdsl("show", "sand-pushing", "--cost", exits=0).stdout
+    text = (ROOT / "tasks" / "keep-ice.yaml").read_text("utf-8")
+    (tmp_path / "ice.yaml").write_text(text.replace("change(count(ice))", "change(count(count(ice) > 2))"))
+    lines = powderdsl("show", tmp_path / "ice.yaml", "--cost", exits=0).stdout.splitlines()
+    assert "step: native code, but 1 of 2 measures on tensors: count(…)" in lines
+
+
 @pytest.mark.parametrize("name", RULESETS)
 def test_show_as_json(name):
     data, rules = json.loads(powderdsl("show", name, "--json", exits=0).stdout), package.load(name)

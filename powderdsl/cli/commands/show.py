@@ -29,6 +29,7 @@ if TYPE_CHECKING:
 @click.command("show")
 @click.argument("rules", metavar="RULES|TASK")
 @opt.option("--json", bool, "One JSON object instead of tables.", to="as_json")
+@opt.option("--cost", bool, "For a task: also which parts of a step do not run in one call of native code.")
 @opt.parameters
 @opt.knobs("For a task: another value for a knob.")
 @opt.option("--split", "SPLIT", "For a task: the set of worlds.", "train")
@@ -37,6 +38,7 @@ if TYPE_CHECKING:
 def command(
     rules: str,
     as_json: bool,
+    cost: bool,
     settings: dict[str, str],
     knobs: dict[str, int],
     split: str,
@@ -52,13 +54,14 @@ def command(
 
         task = load_task(rules, knobs=knobs, params=settings)
         check_split(task, split)
-        _show(*_of_task(task), as_json)
+        head, tables = _of_task(task)
+        _show(head | ({"step": _step_text(task, split)} if cost else {}), tables, as_json)
         if out is not None:
             _write_sheet(task, split, worlds, out)
             click.echo(f"wrote {out}: worlds 0 to {worlds - 1} of {split}", err=as_json)
         return
-    if out is not None or knobs:
-        raise BadInput("--out and --knob go with a task")
+    if out is not None or knobs or cost:
+        raise BadInput("--out, --knob and --cost go with a task")
     _show(*_of_rules(opt.load_rules(rules, settings)), as_json)
 
 
@@ -242,6 +245,20 @@ def _of_task(task: Task) -> tuple[dict[str, Any], Tables]:
         for knob in task.knobs
     ]
     return head, {"splits": splits, "knobs": knobs}
+
+
+def _step_text(task: Task, split: str) -> str:
+    """What an environment's step runs, where there is a C++ compiler."""
+    from powderdsl.tasks.episodes import compile_task
+
+    meter = compile_task(task, split=split).meter
+    left = [measure for number, measure in enumerate(meter.measures) if number not in meter.on_planes]
+    if not left:
+        return "one call of native code"
+    places = ", ".join(
+        f"{measure.how}(…{f' in {measure.region}' if measure.region else ''})" for measure in left
+    )
+    return f"native code, but {len(left)} of {len(meter.measures)} measures on tensors: {places}"
 
 
 def _agent_text(task: Task) -> Iterator[str]:

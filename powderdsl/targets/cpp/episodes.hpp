@@ -79,9 +79,11 @@ struct Play {
   double* sizes;
   int64_t measures, mask_words, own_masks;  // whether each world has its own
   Formula each, final, success, failure;
-  // Start worlds: episode e of world i lies at i * depth + e % depth; `filled` is the first that is not there.
+  // Start worlds: episode e of world i lies at i * depth + e % depth; `filled` is the first that is not there. Or, without
+  // `depth`, the first `start_worlds` of a split, which episodes draw from as `world_seeds` does.
   const void* pool;
-  int64_t depth;
+  int64_t depth, start_worlds;
+  int64_t* base;
   const int64_t *pool_world, *filled;
   const double *pool_start, *pool_sizes;
   const u64* pool_masks;
@@ -252,10 +254,17 @@ static double value_of(const Play& p, const Formula& formula, int world, double*
 static void observe(const Play& p, const Batch& b, int first, int last) {
   for (int i = 0; i < p.views; i++) show(b, lanes_of(b, first, last), p.view[i], p.observed, p.size);
 }
+static int64_t drawn_world(const Play& p, int i) {  // as world_seeds of envs/tensor_env.py
+  const u64 base = p.base[i];
+  const u32 episode = (u32)p.episode[i], key = mix(mix((u32)base) ^ (u32)(base >> 32));
+  const u64 high = mix(key + episode), low = mix(key ^ mix(episode));
+  return (p.episode[i] == 0 ? base : high << 31 | low >> 1) % (u64)p.start_worlds;
+}
 static void begin(Play& p, Batch& b, int i) {
-  const int64_t at = i * p.depth + ++p.episode[i] % p.depth, n = p.measures;
+  const int64_t episode = ++p.episode[i], n = p.measures;
+  const int64_t at = p.depth ? i * p.depth + episode % p.depth : drawn_world(p, i);
   copy_world(b, i, *(const Batch*)p.pool, at);
-  p.world[i] = p.seed[i] = p.pool_world[at];
+  p.world[i] = p.seed[i] = p.depth ? p.pool_world[at] : at;
   p.index[i] = p.step[i] = p.acted[i] = p.failed[i] = 0;
   p.returned[i] = 0;
   std::copy_n(p.pool_start + at * n, n, p.start + i * n);
@@ -292,7 +301,7 @@ API int pd_finish(Play* play) {
     r.last_shown[i] = p.world[i];
     p.begins[i] = p.mode == NEXT_STEP ? waits : p.mode == SAME_STEP && ended;
     if (p.mode != SAME_STEP) p.waiting[i] = ended;
-    ready &= !p.begins[i] || p.episode[i] + 1 < p.filled[i];
+    ready &= !p.begins[i] || !p.depth || p.episode[i] + 1 < p.filled[i];
   }
   std::copy_n(p.now, values, p.before);
   return ready;

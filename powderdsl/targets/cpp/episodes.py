@@ -45,6 +45,6 @@ class Play(ctypes.Structure):
         *_whole("world acted episode failed waiting start before now returned"),
         *_whole("counts masks sizes measures mask_words own_masks"),
         *((name, Formula) for name in ("each", "final", "success", "failure")),
-        *_whole("pool depth pool_world filled pool_start pool_sizes pool_masks"),
+        *_whole("pool depth start_worlds base pool_world filled pool_start pool_sizes pool_masks"),
         *_whole("views size view observed last_observed results action begins counted"),
     )

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from powderdsl.ir.bits import NotBits, lower_bits
+from powderdsl.ir.bits import NotBits, lower_bits, plane_slots
 from powderdsl.ir.lower import Inputs, ir_type, lower_expression, part_names
 from powderdsl.ir.ops import FLAG, Graph, Node, PassGraph, Program, SlotType, Type, component_of, plane_name
 from powderdsl.ir.stages import run_passes
@@ -156,11 +157,16 @@ class Meter:
     def counts(self, program: NativeProgram) -> CellCounts | None:
         """Return a counter of the measures in packed worlds that bit planes show; None if they show none."""
         if self._counts is None or self._counts[0] is not program:
-            shown = [number for number in range(len(self.measures)) if self._counter(program, [number])]
-            self._counts = program, self._counter(program, shown)
+            self._counts = program, self._counter(program.layout.planes, self.on_planes)
         return self._counts[1]
 
-    def _counter(self, program: NativeProgram, numbers: Sequence[int]) -> CellCounts | None:
+    @cached_property
+    def on_planes(self) -> tuple[int, ...]:
+        """The numbers of the measures that bit planes show."""
+        planes = {slot.name: 0 for slot in plane_slots(_lowered(self.ruleset, ()).slots)}
+        return tuple(number for number in range(len(self.measures)) if self._counter(planes, [number]))
+
+    def _counter(self, planes: Mapping[str, int], numbers: Sequence[int]) -> CellCounts | None:
         """Return a counter of some measures, or None if bit planes do not show them all."""
         names = [*self._regions]
         for name in self._targets:
@@ -186,7 +192,7 @@ class Meter:
                         counted.append(
                             Counted(flags[plane_name(name, bit)], i, measure.region, False, weight)
                         )
-            return CellCounts(counted, len(self.measures), program.layout.planes, masks, self._rows(numbers))
+            return CellCounts(counted, len(self.measures), planes, masks, self._rows(numbers))
         except (NotBits, KeyError, ValueError):
             return None  # floats, neighbors, too many gates: tensors show them
 
