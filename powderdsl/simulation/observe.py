@@ -20,7 +20,7 @@ from powderdsl.ir.ops import component_of
 from powderdsl.model.state import Slot, property_dtype, property_values, slots
 from powderdsl.model.types import Ruleset
 from powderdsl.simulation.draw import looks, rgb
-from powderdsl.targets.cpp.program import NativeProgram, PackedState, Views
+from powderdsl.targets.cpp.program import NativeProgram, PackedState, Places, Views
 from powderdsl.targets.job import shape_of
 from powderdsl.targets.tensor_kind import Tensors, pack, word_count
 
@@ -107,7 +107,7 @@ class Observer:
             out[:, place] = pack((state[name] >> bit) & 1 != 0)
         return out
 
-    def views(self, kind: str, program: NativeProgram, cells: int) -> Views:
+    def views(self, kind: str, program: Places, cells: int) -> Views:
         """Return what native code writes for ``ids`` or a method's observations, for worlds of a number of cells."""
         views, homes = Views(), program.homes
         ids = homes["element"][:2]

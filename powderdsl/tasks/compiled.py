@@ -19,7 +19,7 @@ from torch import Tensor
 from powderdsl.model.types import Expr
 from powderdsl.simulation.simulator import World
 from powderdsl.targets.cpp.episodes import ACTION_NUMBERS, MODES, OPS, Fresh, Play
-from powderdsl.targets.cpp.program import NativeProgram, PackedState, Views
+from powderdsl.targets.cpp.program import NativeProgram, PackedState, Places, Views
 from powderdsl.tasks.episodes import Episodes, TaskProgram
 from powderdsl.tasks.tensors.measures import Masks
 
@@ -98,12 +98,12 @@ class Results:
         return self._references() == self._counts
 
 
-class Stepper:
-    """Steps a batch of episodes of one task program in native code.
+class Plan:
+    """What a step of a task's episodes does, whatever the worlds: `play` without their arrays.
 
     Args:
         program: the task.
-        native: the code of its rules, for its width.
+        places: where the code of its rules keeps a state.
         views: what an observation shows, of `size` bytes a world.
         mode: the name of an autoreset mode.
         limit: actions after which an episode is truncated.
@@ -116,7 +116,7 @@ class Stepper:
     def __init__(
         self,
         program: TaskProgram,
-        native: NativeProgram,
+        places: Places,
         views: Views,
         size: int,
         mode: str,
@@ -126,19 +126,16 @@ class Stepper:
         columns: Tensor | None,
         table: Tensor,
     ):
-        self.program, self.native, self.views = program, native, views
-        self._kept: list[Any] = []
-        """Arrays whose addresses are in `play`."""
+        self.program, self.places, self.views = program, places, views
+        self.arrays: dict[str, Any] = {}
+        """Arrays whose addresses are in `play`, by the names of its members."""
         agent, goal, hands = program.task.agent, program.task.goal, program.hands
-        self.counts = program.meter.counts(native)
+        self.counts = program.meter.counts(places)
         counted = 0 if self.counts is None else len(self.counts.numbers)
         self.measures_cells = counted < len(program.measures)
         """Whether some measures are taken of tensors, between two parts of a step."""
-        self.filled: Tensor | None = None
-        """int64 [B]: the first episode of each row whose start world has not been made."""
-        self._ahead: Episodes | None = None
         self.play = play = Play(
-            threads=native.threads,
+            threads=1,
             steps=agent.steps_per_action,
             free_steps=agent.free_steps,
             actions=agent.actions,
@@ -155,44 +152,55 @@ class Stepper:
             counts=0 if self.counts is None else ctypes.addressof(self.counts.plan),
             counts_painted=hands.counts,
         )
-        self._play = ctypes.byref(play)
-        self._has_maps = False
-        play.most = self._address(np.array(most, np.int64))
+        play.most = self._address("most", np.array(most, np.int64))
         if columns is None:
-            play.table = self._address(table)
+            play.table = self._address("table", table)
         else:
-            play.column = self._address(columns)
-        play.row_edges, play.column_edges = map(self._address, hands.blocks.edges)
-        play.choices = self._address(np.array(agent.choices, np.int64))
-        play.element, play.element_bits, _ = native.homes["element"]
+            play.column = self._address("column", columns)
+        for name, edges in zip(("row_edges", "column_edges"), hands.blocks.edges, strict=True):
+            setattr(play, name, self._address(name, edges))
+        play.choices = self._address("choices", np.array(agent.choices, np.int64))
+        play.element, play.element_bits, _ = places.homes["element"]
         fresh = list(self._fresh_values())
-        play.fresh_count, play.fresh = len(fresh), self._address((Fresh * len(fresh))(*fresh))
-        speeds = [] if agent.speed_field is None else native.pieces[agent.speed_field]
-        play.speed_row, play.speed_column = [native.homes[piece.slot][0] for piece in speeds] or (-1, -1)
+        play.fresh_count, play.fresh = len(fresh), self._address("fresh", (Fresh * len(fresh))(*fresh))
+        speeds = [] if agent.speed_field is None else places.pieces[agent.speed_field]
+        play.speed_row, play.speed_column = [places.homes[piece.slot][0] for piece in speeds] or (-1, -1)
         for name in ("each", "final", "success", "failure"):
             steps = operations(getattr(goal, name), program.measure_numbers)
-            getattr(play, name).count, getattr(play, name).ops = len(steps), self._address(steps)
+            getattr(play, name).count, getattr(play, name).ops = len(steps), self._address(name, steps)
 
-    def _address(self, values: Any) -> int:
-        """Return the address of an array, which is kept."""
-        if isinstance(values, Tensor):
-            values = values.contiguous()
-            self._kept.append(values)
-            return values.data_ptr()
-        self._kept.append(values)
-        return ctypes.addressof(values) if isinstance(values, ctypes.Array) else values.ctypes.data
+    def _address(self, name: str, values: Any) -> int:
+        """Return the address of an array, which is kept by a name."""
+        if isinstance(values, ctypes.Array):
+            self.arrays[name] = values
+            return ctypes.addressof(values)
+        self.arrays[name] = array = np.ascontiguousarray(values)
+        return array.ctypes.data
 
     def _fresh_values(self) -> Iterator[Fresh]:
         """Yield what placed elements set in each slot that travels with them."""
         choices = np.array(self.program.task.agent.choices).clip(0)
         for name, table in self.program.hands.blocks.fresh.items():
             values = table.cpu()[choices]
-            for piece in self.native.pieces[name]:
+            for piece in self.places.pieces[name]:
                 part = values if piece.component is None else values[:, piece.component]
-                slot, bits, _ = self.native.homes[piece.slot]
-                yield Fresh(slot, bits, self._address(part.long() if bits else part.float()))
+                slot, bits, _ = self.places.homes[piece.slot]
+                yield Fresh(
+                    slot, bits, self._address(f"fresh {piece.slot}", part.long() if bits else part.float())
+                )
 
-    # Episodes
+
+class Stepper(Plan):
+    """Steps a batch of episodes in native code. `how`: the arguments of `Plan`."""
+
+    def __init__(self, program: TaskProgram, native: NativeProgram, *how: Any):
+        super().__init__(program, native, *how)
+        self.native, self.play.threads = native, native.threads
+        self.filled: Tensor | None = None
+        """int64 [B]: the first episode of each row whose start world has not been made."""
+        self._ahead: Episodes | None = None
+        self._play = ctypes.byref(self.play)
+        self._has_maps = False
 
     def bind(self, episodes: Episodes, params: Mapping[str, Tensor], kept: Mapping[str, Tensor]) -> Episodes:
         """Return the episodes in memory that steps write to from now on.

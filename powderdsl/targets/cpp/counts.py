@@ -99,9 +99,9 @@ class CellCounts:
             ends.append((end, count.number, count.highest, count.weight))
         if len(gates) > MOST_GATES:
             raise ValueError(f"{len(gates)} gates")
-        self._gates, self._ends = np.array(gates, np.int32), np.array(ends, _COUNT)
+        self.gates, self.ends = np.array(gates, np.int32), np.array(ends, _COUNT)
         self.plan = CountsPlan(
-            len(gates), len(ends), numbers, *rows, self._gates.ctypes.data, self._ends.ctypes.data
+            len(gates), len(ends), numbers, *rows, self.gates.ctypes.data, self.ends.ctypes.data
         )
 
     def take(self, library: Any, handle: int, masks: Tensor, sizes: Tensor, values: Tensor) -> None:

@@ -79,8 +79,8 @@ struct Play {
   double* sizes;
   int64_t measures, mask_words, own_masks;  // whether each world has its own
   Formula each, final, success, failure;
-  // Start worlds: episode e of world i lies at i * depth + e % depth; `filled` is the first that is not there. Or, without
-  // `depth`, the first `start_worlds` of a split, which episodes draw from as `world_seeds` does.
+  // Start worlds: episode e of world i lies at i * depth + e % depth; `filled` is the first that is not there. Or
+  // `start_worlds`, if there are any: the first ones of a split, which episodes draw from as `world_seeds` does.
   const void* pool;
   int64_t depth, start_worlds;
   int64_t* base;
@@ -262,9 +262,9 @@ static int64_t drawn_world(const Play& p, int i) {  // as world_seeds of envs/te
 }
 static void begin(Play& p, Batch& b, int i) {
   const int64_t episode = ++p.episode[i], n = p.measures;
-  const int64_t at = p.depth ? i * p.depth + episode % p.depth : drawn_world(p, i);
+  const int64_t at = p.start_worlds ? drawn_world(p, i) : i * p.depth + episode % p.depth;
   copy_world(b, i, *(const Batch*)p.pool, at);
-  p.world[i] = p.seed[i] = p.depth ? p.pool_world[at] : at;
+  p.world[i] = p.seed[i] = p.start_worlds ? at : p.pool_world[at];
   p.index[i] = p.step[i] = p.acted[i] = p.failed[i] = 0;
   p.returned[i] = 0;
   std::copy_n(p.pool_start + at * n, n, p.start + i * n);
@@ -301,7 +301,7 @@ API int pd_finish(Play* play) {
     r.last_shown[i] = p.world[i];
     p.begins[i] = p.mode == NEXT_STEP ? waits : p.mode == SAME_STEP && ended;
     if (p.mode != SAME_STEP) p.waiting[i] = ended;
-    ready &= !p.begins[i] || !p.depth || p.episode[i] + 1 < p.filled[i];
+    ready &= !p.begins[i] || p.start_worlds || p.episode[i] + 1 < p.filled[i];
   }
   std::copy_n(p.now, values, p.before);
   return ready;

@@ -104,13 +104,14 @@ class Views:
 
     def __init__(self) -> None:
         self.parts: list[View] = []
-        self._tables: list[Tensor] = []
+        self.tables: list[list[Tensor]] = []
+        """Those of each part."""
 
     def add(
         self, kind: str, *numbers: int, number: float = 0, tables: Sequence[Tensor] = (), offset: int = 0
     ) -> None:
         """Add a part that begins at the byte `offset` of each world's memory."""
-        self._tables += tables
+        self.tables.append([*tables])
         places = [table.data_ptr() for table in tables] + [None] * (2 - len(tables))
         whole = (ctypes.c_int * 9)(*numbers)
         self.parts.append(View(VIEWS.index(kind), whole, number, *places, offset))
@@ -185,18 +186,23 @@ class PackedState(OwnedBatch):
         return changed
 
 
-class NativeProgram:
+class Places:
+    """Where generated code keeps the pieces of a state: `homes` are as `Layout.home` gives them, by slot."""
+
+    def __init__(self, layout: Layout, pieces: Mapping[str, tuple[Piece, ...]]):
+        self.layout, self.pieces = layout, pieces
+        self.homes = {piece.slot: layout.home(piece) for parts in pieces.values() for piece in parts}
+
+
+class NativeProgram(Places):
     """A program as compiled C++. Passes are timed on one thread, in processor time."""
 
     def __init__(self, code: NativeCode, threads: int):
+        super().__init__(code.layout, code.pieces)
         self.library = load_library(code.library)
         self.code, self.threads = code, threads
-        self.layout, self.pieces = code.layout, code.pieces
         self._inputs: dict[int, Inputs] = {}
         """By the `id` of the mapping, which the inputs keep alive."""
-        self.homes = {
-            piece.slot: self.layout.home(piece) for parts in self.pieces.values() for piece in parts
-        }
 
     def run(self, job: Job) -> Mapping[str, Tensor]:
         """The state `job.steps` later. Jobs with given draws or chosen passes are for other backends."""

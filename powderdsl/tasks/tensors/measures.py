@@ -18,7 +18,7 @@ from powderdsl.model.state import slots
 from powderdsl.model.types import Expr, Ruleset
 from powderdsl.simulation.simulator import World
 from powderdsl.targets.cpp.counts import CellCounts, Counted
-from powderdsl.targets.cpp.program import NativeProgram, PackedState
+from powderdsl.targets.cpp.program import PackedState, Places
 from powderdsl.targets.tensor_kind import pack
 from powderdsl.targets.torch.program import DTYPES, Kernels, PassFunction, compiled
 from powderdsl.targets.torch.source import pass_source
@@ -75,7 +75,7 @@ class Meter:
     ):
         self.ruleset, self.measures, self.size, self.device = ruleset, measures, size, device
         self._fixed = fixed
-        self._counts: tuple[NativeProgram, CellCounts | None] | None = None
+        self._counts: tuple[Places, CellCounts | None] | None = None
         values = [(number, measure) for number, measure in enumerate(measures) if measure.value is not None]
         self._cells = _Cells(ruleset, values, size, device) if values else None
         self._bits = range(_types(ruleset)["element"].bits)
@@ -154,7 +154,7 @@ class Meter:
             size = torch.tensor([whole], device=self.device)
         return size.clamp(min=1).double()
 
-    def counts(self, program: NativeProgram) -> CellCounts | None:
+    def counts(self, program: Places) -> CellCounts | None:
         """Return a counter of the measures in packed worlds that bit planes show; None if they show none."""
         if self._counts is None or self._counts[0] is not program:
             self._counts = program, self._counter(program.layout.planes, self.on_planes)
