@@ -34,7 +34,7 @@ GROUPS = {
         "explain": "Explain a diagnostic code and how to fix it.",
         "compile": "Print the output of a compiler stage.",
         "bench": "Measure how fast rules run, on each backend, batch and size.",
-        "export": "Write rules as a WebAssembly module, for a page or a game.",
+        "export": "Write rules as a WebAssembly module, or a task as a C header.",
         "cache": "List or remove cached compiled code.",
     },
     "Learn": {

@@ -17,6 +17,7 @@ from powderdsl.envs.tensor_env import (
     reset_mask,
     world_seeds,
 )
+from powderdsl.targets.cpp.program import Places
 from powderdsl.tasks.compiled import EMPTY, Results, Stepper
 
 Steps = tuple[Any, Any, Any, Any, dict[str, Any]]
@@ -42,20 +43,7 @@ class CompiledEnv(TensorEnv):
         if native is None or self.episodes is None:
             return None
         if self._stepper is None or self._stepper.native is not native:
-            form, space = self.action_form, self.observation.space
-            cells = self.task.size[0] * self.task.size[1]
-            self._stepper = Stepper(
-                self.program,
-                native,
-                self.simulator.observer.views(self.observation.kind, native, cells),
-                int(np.prod(space.shape)) * space.dtype.itemsize,
-                self.autoreset_mode.name,
-                self.max_episode_steps,
-                self.last_action_terminates,
-                form.nvec,
-                None if form.kind == "discrete" else form.columns,
-                form.table,
-            )
+            self._stepper = Stepper(self.program, native, *plan_arguments(self, native))
             self._results: list[Results] = []
         params = self.simulator.parameters(self.params, self.num_envs)
         kept = {"episode": self._episode, "returned": self._returned, "waiting": self._ended}
@@ -165,6 +153,22 @@ class CompiledEnv(TensorEnv):
                 raise ValueError(f"{len(checked)} actions for {self.num_envs} environments")
             given = np.asarray(actions)
         np.copyto(numbers, given.reshape(numbers.shape), casting="unsafe")
+
+
+def plan_arguments(env: TensorEnv, places: Places) -> tuple[Any, ...]:
+    """Return the arguments of `Plan` after its first two, for what an environment's step does."""
+    form, space, size = env.action_form, env.observation.space, env.task.size
+    assert space.dtype is not None
+    return (
+        env.simulator.observer.views(env.observation.kind, places, size[0] * size[1]),
+        int(np.prod(space.shape)) * space.dtype.itemsize,
+        env.autoreset_mode.name,
+        env.max_episode_steps,
+        env.last_action_terminates,
+        form.nvec,
+        None if form.kind == "discrete" else form.columns,
+        form.table,
+    )
 
 
 def arrays_of(info: Info) -> dict[str, Any]:

@@ -309,12 +309,17 @@ class Stepper(Plan):
             target[rows] = self._ahead.targets[name][places]
 
     def fill(self, numbers: Callable[[Tensor, Tensor], Tensor]) -> None:
-        """Make the start worlds of the next episodes; `numbers` gives those of rows and episodes, int64 [n] each."""
+        """Make the start worlds of the next episodes if one that begins lacks its own.
+
+        `numbers` gives the worlds of rows and episodes, int64 [n] each.
+        """
         worlds = len(self.begins)
         cells = worlds * self.program.task.size[0] * self.program.task.size[1]
         depth = self.play.depth = min(max(2 if cells < POOL_CELLS else 1, POOL_CELLS // cells), MOST_AHEAD)
         assert self.filled is not None
         episode = self._tensors["episode"]
+        if not bool((self.begins & (episode + 1 >= self.filled)).any()):
+            return
         first, end = torch.maximum(self.filled, episode + 1), episode + 1 + depth
         count = end - first
         rows = torch.arange(worlds).repeat_interleave(count)

@@ -74,6 +74,7 @@ QUICK = [
     ("new thing", WORKS, WORKS),
     ("render life --out r.png", WORKS, WORKS),
     ("export life --out l.wasm", WORKS, WORKS),
+    ("export --env sand-pushing --out e.h", "torch", "numpy"),
     ("explain PD612", WORKS, WORKS),
 ]
 SLOW = [

@@ -1,30 +1,72 @@
-"""`powderdsl export`: write rules as a WebAssembly module that runs in any page."""
+"""`powderdsl export`: write rules as a WebAssembly module for any page, or a task's environment as C."""
 
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import click
 
 from powderdsl.cli import options as opt
-from powderdsl.system.writing import replacing
+from powderdsl.cli.exits import BadInput
+from powderdsl.system.writing import replacing, write_text
 
 
 @click.command("export")
-@click.argument("rules", metavar="RULES")
-@opt.output("--out", "FILE", "The .wasm file to write.", ".wasm", required=True)
-@opt.option("--size", opt.SIZE, "Rows and columns.", "64")
+@click.argument("rules", metavar="RULES|TASK")
+@opt.output(
+    "--out", "FILE", "The .wasm file to write, or with --env the .h file.", ".wasm", ".h", required=True
+)
+@opt.option("--size", opt.SIZE, "Rows and columns.  [default: 64]")
+@opt.option(
+    "--env", bool, "Write the environment of TASK: a C header, and a .cpp file beside it.", to="as_env"
+)
+@opt.option("--split", "SPLIT", "With --env: the set of worlds.", "train")
+@opt.option("--worlds", (1, 4096), "With --env: how many start worlds of the split.", 64)
+@opt.option(
+    "--observation", ("ids", "compact", "matrix", "rgb"), "With --env: what observations show.", "ids"
+)
+@opt.option(
+    "--actions", ("multidiscrete", "discrete", "full"), "With --env: the form of actions.", "multidiscrete"
+)
+@opt.knobs("With --env: another value for a knob.")
 @opt.parameters
-def command(rules: str, out: Path, size: tuple[int, int], settings: dict[str, str]) -> None:
-    """Write rules as a WebAssembly module, for a page or a game.
+def command(
+    rules: str,
+    out: Path,
+    size: tuple[int, int] | None,
+    as_env: bool,
+    worlds: int,
+    settings: dict[str, str],
+    **how: Any,
+) -> None:
+    """Write rules as a WebAssembly module, for a page or a game; or a task's environment as C.
 
     The module is a world of one size. It imports nothing, and a page needs fifteen lines of JavaScript to run it:
-    docs/export.md.
+    docs/export.md. An environment is compiled with a program, and its episodes begin in worlds that it contains.
+
+    \b
+        powderdsl export powderworld --out rules.wasm
+        powderdsl export --env sand-pushing --out env.h
     """
-    ruleset = opt.load_rules(rules, settings)
+    if out.suffix.lower() != (".h" if as_env else ".wasm"):
+        raise BadInput(f"{out}: --env writes a .h file, and nothing else does")
+    if as_env:
+        if size is not None:
+            raise BadInput("--size goes with rules: a task has its own")
+        from powderdsl.envs.header import c_environment
+        from powderdsl.envs.tensor_env import TensorEnv
+
+        env = TensorEnv(rules, params=settings, **how)
+        texts, source = c_environment(env, worlds, out.name), out.with_suffix(".cpp")
+        write_text(source, texts.source)
+        write_text(out, texts.header)
+        click.echo(f"{out}, {source}: {env.task.name}, {worlds} start worlds of {env.split}")
+        return
+    ruleset, (rows, columns) = opt.load_rules(rules, settings), size or (64, 64)
     from powderdsl.simulation.standalone import standalone_module
 
-    code = standalone_module(ruleset, size)
+    code = standalone_module(ruleset, (rows, columns))
     with replacing(out, follow=True) as temporary:
         temporary.write_bytes(code)
-    click.echo(f"{out}: {ruleset.name}, {size[0]}×{size[1]} cells, {len(code):,} bytes")
+    click.echo(f"{out}: {ruleset.name}, {rows}×{columns} cells, {len(code):,} bytes")

@@ -10,12 +10,7 @@ struct powder_env {
   std::vector<float> reals;
 };
 
-// Values of the start worlds: of element ids by a table, or in runs of a count and a value.
-struct PieceData {
-  int slot, bits, item;
-  const u32* runs;   // or null
-  const u32* table;  // [256], or null
-};
+// Values of the start worlds: of element ids by a table [256], or in runs of a count and a value.
 template <class T> static void load_piece(void* batch, const PieceData& piece, const std::vector<uint8_t>& ids) {
   std::vector<T> cells(ids.size());
   size_t at = 0;
