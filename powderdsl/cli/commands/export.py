@@ -46,8 +46,8 @@ def command(
     docs/export.md. An environment is compiled with a program, and its episodes begin in worlds that it contains.
 
     \b
-        powderdsl export powderworld --out rules.wasm
-        powderdsl export --env sand-pushing --out env.h
+        powderdsl export RULES --out rules.wasm
+        powderdsl export --env TASK --out env.h
     """
     if out.suffix.lower() != (".h" if as_env else ".wasm"):
         raise BadInput(f"{out}: --env writes a .h file, and nothing else does")
