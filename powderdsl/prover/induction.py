@@ -36,6 +36,10 @@ HERE: Cell = (0, 0)
 MAX_WHOLE = 40_000
 """Gates and terms of a pass that is looked at as a whole."""
 
+ARRIVING = [(0, -1), (1, -1), (2, 0)]
+READS = {"shift": [(0, 1)], "swap": [*ARRIVING, (0, 1), (1, 0)], "arrive": ARRIVING}
+"""Which arguments a node reads in other cells: at its offset (1), opposite to it (-1) or here (0)."""
+
 Law = Callable[["Moment", World, Cell], Literal]
 """A function that says whether a claim holds at a cell of a world of a moment."""
 
@@ -186,8 +190,7 @@ class Prover:
     def _make_moments(self, number: int, cut: bool) -> list[Moment]:
         moments = []
         pass_, ranges = self.planes[number], self.ranges[number + cut]
-        state: dict[str, Node] = {}
-        known: dict[Node, tuple[str, str]] = {}
+        state, known = dict[str, Node](), dict[Node, tuple[str, str]]()
         row = self.start.symbols.layouts["element"]
         evaluation = Evaluation(begin := Before(symbols := self._symbols(MAX_WHOLE)), symbols)
         for place, substep in enumerate(pass_.substeps):
@@ -195,7 +198,8 @@ class Prover:
             moves = tuple(_moves(elements, known))
             if cut:
                 begin = Before(symbols := self._symbols(MAX_WHOLE))
-                evaluation = Evaluation(begin, symbols, cut=dict(known))
+                evaluation = Evaluation(begin, symbols)
+                evaluation.cut = dict(known)
             before = evaluation.after(state.items())
             state |= dict(substep.writes)
             ends = pass_.outputs if place == len(pass_.substeps) - 1 else ()
@@ -395,10 +399,18 @@ class Prover:
         """Return the distance, in rows or columns, of the cells on which a cell depends after a step."""
         total = 0
         for pass_ in self.planes:
-            evaluation = Evaluation(before := Before(symbols := self._symbols()), symbols)
-            for _, node in pass_.outputs:
-                evaluation.value(node, *HERE)
-            total += before.reach
+            far: dict[Node, tuple[int, ...]] = {}  # by node: how far it reads up, down, left and right
+            for node in nodes_of(pass_, substeps=False):
+                dy, dx = node.attr[:2] if node.op in READS else (0, 0)
+                boxes = [
+                    [
+                        way + sign * more
+                        for way, more in zip(far[node.args[i]], (-dy, dy, -dx, dx), strict=True)
+                    ]
+                    for i, sign in READS.get(node.op, [(i, 0) for i in range(len(node.args))])
+                ]
+                far[node] = (*map(max, zip(*boxes, strict=True)),) or (0, 0, 0, 0)
+            total += max((max(far[node]) for _, node in pass_.outputs), default=0)
         return total
 
     def _symmetric(self, number: int, turn: str) -> Moment | None:

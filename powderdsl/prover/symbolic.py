@@ -315,15 +315,11 @@ class Before:
 
     def __init__(self, symbols: Symbols, tag: str = "") -> None:
         self.symbols, self.tag = symbols, tag
-        self.reach = 0
-        """The distance of the farthest cell that was read, in rows or columns."""
 
     def bit(self, plane: str, y: int, x: int) -> Literal:
-        self.reach = max(self.reach, abs(y), abs(x))
         return self.symbols.net.variable("cell", self.tag, plane, y, x)
 
     def real(self, slot: str, y: int, x: int) -> Term:
-        self.reach = max(self.reach, abs(y), abs(x))
         return self.symbols.terms.leaf("cell", self.tag, slot, y, x)
 
 
@@ -411,14 +407,9 @@ class Names:
 class Evaluation:
     """Nodes as formulas over a world before. Nodes of `cut` may have any value, in the plane of the world that it names."""
 
-    def __init__(
-        self,
-        before: World,
-        symbols: Symbols,
-        names: Names | None = None,
-        cut: Mapping[Node, tuple[str, str]] | None = None,
-    ) -> None:
-        self.before, self.symbols, self.names, self.cut = before, symbols, names or Names(), cut or {}
+    def __init__(self, before: World, symbols: Symbols, names: Names | None = None) -> None:
+        self.before, self.symbols, self.names = before, symbols, names or Names()
+        self.cut: Mapping[Node, tuple[str, str]] = {}
         self._values: dict[tuple[Node, int, int], int] = {}
 
     def after(self, writes: Iterable[tuple[str, Node]]) -> Written:

@@ -117,10 +117,11 @@ class InvariantSearch:
         for trial, judgment in zip(trials, results, strict=True):
             trial.proof, trial.reason = "induction" if judgment.is_proven else "", judgment.reason
             if judgment.model is not None:
-                search = replace(self, trials=[trial])
-                for sample, _, steps in starts(judgment.model, ruleset):
-                    if trial.sample is None:
-                        search.try_sample(sample, steps)
+                search, undrawn = replace(self, trials=[trial]), replace(ruleset, streams=())
+                for sample, _, steps in starts(judgment.model, undrawn):
+                    search.try_sample(sample, steps)
+                    if trial.sample is not None:
+                        break
 
     @property
     def undecided(self) -> list[Result]:
