@@ -153,12 +153,9 @@ struct Clocks {
   const u64 *seed, *index, *step;
   u64 since;  // steps after `step`
 };
-static int world_of(const Context& c, int number, int lane) {  // unused lanes are the last world once more
-  return (number * LANES + std::min(lane, c.lanes - 1)) / c.g.strips;
-}
-static void begin_step(Context& c, const Clocks& k, int number, long done) {
+static void begin_step(Context& c, const Clocks& k, long done) {
   U step[PARTS];
-  by_hash(step, [&](int l) { return (u32)(k.step[world_of(c, number, l)] + done); });
+  by_hash(step, [&](int l) { return (u32)(k.step[c.worlds[l]] + done); });
   for (int i = 0; i < PARTS; i++) {
     const U first = mix(c.world_keys[0][i] + step[i]), second = mix(c.world_keys[1][i] + step[i]);
     for (int s = 0; s < STREAMS; s++) {
@@ -169,7 +166,7 @@ static void begin_step(Context& c, const Clocks& k, int number, long done) {
   std::fill_n(c.tossed, COINS, false);
   for (int i = 0; i < STEP_PLANES; i++)
     for (int l = 0; l < LANES; l++) {
-      u64 step = k.step[world_of(c, number, l)] + done;
+      u64 step = k.step[c.worlds[l]] + done;
       c.step_bits[i][l] = (step % STEP_TABLE[i].a) >> STEP_TABLE[i].b & 1 ? FULL : 0;
     }
 }
@@ -198,13 +195,13 @@ static void look(Context& c) {
 static void run_group(Context& c, Batch& b, int number, long steps, const Clocks& k, const uint8_t* planes, const float* reals) {
   c.lanes = std::min(LANES, b.lanes() - number * LANES);
   for (int l = 0; l < LANES; l++) {
-    const int world = world_of(c, number, l);
+    const int world = c.worlds[l] = (number * LANES + std::min(l, c.lanes - 1)) / c.g.strips;
     for (int i = 0; i < PARAM_PLANES; i++) c.param_bits[i][l] = planes[(size_t)i * b.worlds + world] ? FULL : 0;
     for (int i = 0; i < PARAM_REALS; i++) c.param_real[i][l] = reals[(size_t)i * b.worlds + world];
   }
   for (int i = 0; i < 2; i++)
     by_hash(c.world_keys[i], [&](int l) {
-      const int world = world_of(c, number, l);
+      const int world = c.worlds[l];
       return world_key(k.seed[world], k.index[world], i ? 0x85A308D3u : 0x243F6A88u);
     });
   Group& group = b.groups[number];
@@ -218,7 +215,7 @@ static void run_group(Context& c, Batch& b, int number, long steps, const Clocks
   for (int i = 0; i < REALS; i++) c.real[i] = group.real[i];
   c.present = group.present;
   for (long s = 0; s < steps; s++) {
-    begin_step(c, k, number, (long)k.since + s);
+    begin_step(c, k, (long)k.since + s);
     reset_slots(c);
     if (ASKED && c.present == ~0ull) look(c);
     run_passes(c);

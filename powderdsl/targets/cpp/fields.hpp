@@ -53,7 +53,7 @@ static void close_plane(const Context& c, Plane* p) {  // nothing beyond the wid
 }
 // Masks of choices, lane by lane: [LANES][height][words][c.masks], so that a lane finds the words of all masks side by side.
 ALWAYS void turn(const V* in, V* out, int lanes) {  // TURN vectors; squares of as many words
-#if VECTOR == 64
+#ifdef SHUFFLES
   V number;
   for (int l = 0; l < LANES; l++) number[l] = l;
   V rows[TURN];
@@ -199,7 +199,7 @@ template <int COUNT> OUTLINE void swap_fields(Context& c, const Plane* movers, i
     for (u32 lanes = lanes_of(some); lanes; lanes &= lanes - 1) {
       const int l = __builtin_ctz(lanes);
       if (l >= c.lanes) break;
-      const int line = l * height + y, base = (l - l % c.g.strips) * height, there = base + lines[line - base + dy];
+      const int line = l * height + y, base = (l & -c.g.strips) * height, there = base + lines[line - base + dy];
       float *from[COUNT], *to[COUNT];
       bool edge = false;  // whether the halos change
       int n = 0;

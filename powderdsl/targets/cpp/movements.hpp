@@ -157,12 +157,13 @@ template <Leaves LEAVES, bool TURNS, bool ROWS> ALWAYS void arrive_near_rows(Con
 OUTLINE void swap_strips(Context& c, const V* m, V* const* data, int n, int here_row, int there_row, int by, int dx) {
   const int words = c.g.words;
   V* seen = c.change + words;
+  const V on = lanes_on(c, by), back = lanes_on(c, -by);
   for (int k = 0; k < n; k++) {
     V *here = data[k] + here_row * words, *there = data[k] + there_row * words;
-    for (int w = 0; w < words; w++) seen[w] = turned(c, there[w], by);
+    for (int w = 0; w < words; w++) seen[w] = turned(there[w], on);
     for (int w = 0; w < words; w++) c.change[w] = (here[w] ^ (dx ? columns(c, seen, w, dx) : seen[w])) & m[w];
     for (int w = 0; w < words; w++) here[w] ^= c.change[w];
-    for (int w = 0; w < words; w++) there[w] ^= turned(c, dx ? columns(c, c.change, w, -dx) : c.change[w], -by);
+    for (int w = 0; w < words; w++) there[w] ^= turned(dx ? columns(c, c.change, w, -dx) : c.change[w], back);
   }
 }
 // A word's columns, moved by dx: those that stay in the word, and those that come into the next.
@@ -321,11 +322,11 @@ template <Leaves LEAVES> OUTLINE void arrive_planes(Context& c, const Plane* mov
   const int edge = dy > 0 ? height - 1 : 0;
   const V* m = movers->data + edge * words;
   if (!dy || !any_word(m, words)) return;
-  const int lanes_back = c.g.strips > 1 ? -dy : 0;
-  for (int w = 0; w < words; w++) targets[w] = turned(c, dx ? columns(c, m, w, -dx) : m[w], lanes_back);
+  const V back = lanes_on(c, -dy);
+  for (int w = 0; w < words; w++) targets[w] = turned(dx ? columns(c, m, w, -dx) : m[w], back);
   for (int k = 0; k < n; k++) {
     V* there = data[k] + (dy > 0 ? 0 : height - 1) * words;
-    for (int w = 0; w < words; w++) there[w] = (there[w] & ~targets[w]) | turned(c, c.late[k * words + w], lanes_back);
+    for (int w = 0; w < words; w++) there[w] = (there[w] & ~targets[w]) | turned(c.late[k * words + w], back);
   }
 }
 OUTLINE Plane* cleared(Context& c, Plane* old, const Plane* where) {  // old and not where

@@ -41,16 +41,18 @@ ALWAYS const V* row_or_nothing(const Context& c, const Plane* p, int y) {
   return p->data + 2 * AROUND_ROWS * c.g.words + (y < 0 ? c.g.above(y) : c.g.below(y) + (BEYOND_ROWS - AROUND_ROWS) * c.g.words);
 }
 
-// Strips. What each lane sees `by` lanes on, around those of its world.
-ALWAYS V turned(const Context& c, V v, int by) {
-  const int others = c.g.strips - 1;
-#if VECTOR == 64
+// Strips. The lane that each lane sees `by` lanes on, around those of its world.
+ALWAYS V lanes_on(const Context& c, int by) {
   V number;
   for (int l = 0; l < LANES; l++) number[l] = l;
-  return two_of(v, mux(splat(others), number + splat(by), number), v);
+  return mux(splat(c.g.strips - 1), number + splat(by), number);
+}
+ALWAYS V turned(V v, V lanes) {  // what each lane sees there
+#ifdef SHUFFLES
+  return two_of(v, lanes, v);
 #else
   V r;
-  for (int l = 0; l < LANES; l++) r[l] = v[(l & ~others) | ((l + by) & others)];
+  for (int l = 0; l < LANES; l++) r[l] = v[lanes[l]];
   return r;
 #endif
 }
@@ -64,9 +66,10 @@ OUTLINE void fill_halo(const Context& c, Plane* p, int rows, bool around) {
       const int by = strips_on(c, y);
       const V* from = p->data + (y - by * height) * words;
       V* to = around ? p->data + c.row(y) : (V*)row_or_nothing(c, p, y);
+      const V lanes = lanes_on(c, by);
       V kept = splat(FULL);
-      if (!around) for (int l = 0; l < LANES; l++) kept[l] = (u32)(l % c.g.strips + by) < (u32)c.g.strips ? FULL : 0;
-      for (int w = 0; w < words; w++) to[w] = turned(c, from[w], by) & kept;
+      if (!around) for (int l = 0; l < LANES; l++) kept[l] = (u32)((l & (c.g.strips - 1)) + by) < (u32)c.g.strips ? FULL : 0;
+      for (int w = 0; w < words; w++) to[w] = turned(from[w], lanes) & kept;
     }
   (around ? p->around : p->beyond) = rows;
 }

@@ -21,7 +21,7 @@ struct Grid {
 #else
   int width, words, stride;
 #endif
-  int strips;  // of a world, in as many lanes; 1 if a lane is a world
+  int strips;  // of a world, in as many lanes: a power of two; 1 if a lane is a world
   int cells() const { return height * words; }
   // Strips have halos: behind the rows of a plane lie those above and below on the torus, then the bare ones.
   int above(int y) const { return (height - 1 - y) * words; }  // y < 0
@@ -59,7 +59,7 @@ struct Context {
   Plane* slot[SLOTS + 1];
   Field* real[REALS + 1];
   std::vector<V*> fixed;  // planes of coordinates and insides, made once
-  int lanes;
+  int lanes, worlds[LANES];  // lanes in use, and the world of each lane; unused lanes are the last world once more
   double* seconds;  // by pass; null if nobody asks
   u64 present;  // the ids that are there, of those that passes ask for; all bits: not known
 

@@ -122,9 +122,12 @@ ALWAYS V rotated(V x, int by) {  // each word to the right, by less than its wid
 #endif
 }
 ALWAYS V mux(V c, V a, V b) { return (c & a) | (~c & b); }
-#if VECTOR == 64
+#if VECTOR == 64 || (WIDTH == 8 && defined(__AVX512VBMI__) && defined(__AVX512VL__))
+#define SHUFFLES
 ALWAYS V two_of(V a, V which, V b) {  // words of a, then of b, by their numbers
-#if WIDTH == 16
+#if WIDTH == 8
+  return (V)_mm256_permutex2var_epi8((__m256i)a, (__m256i)which, (__m256i)b);
+#elif WIDTH == 16
   return (V)_mm512_permutex2var_epi16((__m512i)a, (__m512i)which, (__m512i)b);
 #elif WIDTH == 32
   return (V)_mm512_permutex2var_epi32((__m512i)a, (__m512i)which, (__m512i)b);
