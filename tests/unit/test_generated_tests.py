@@ -6,7 +6,7 @@ import pytest
 
 from powderdsl.diagnostics import Source
 from powderdsl.simulation.simulator import compile
-from powderdsl.testing.mutation.judging import GeneratedTest, Original, with_tests, written_test
+from powderdsl.testing.mutation.judging import GeneratedTest, Original, judge, with_tests, written_test
 from powderdsl.testing.pack_tests.runner import run_examples
 from powderdsl.testing.properties.comparison import distinguish
 from tests.semantics.texts import load_text
@@ -86,3 +86,11 @@ def test_fields_are_drawn_where_elements_do_not_tell(tmp_path, old, new, drawn):
     body = "tests:\n" + "".join(f"  {line}\n" for line in text.splitlines())
     assert run_examples(load_text(FIELDS + body))[0].passed
     assert not run_examples(load_text(FIELDS.replace(old, new) + body))[0].passed
+
+
+def test_no_test_is_written_for_a_world_with_other_parameters():
+    forest = Original.of("forest_fire")
+    verdicts = [judge(forest, mutant) for mutant in forest.mutants() if mutant.operator == "order"]
+    alive = [verdict for verdict in verdicts if verdict.status == "survived"]
+    assert alive
+    assert {(verdict.differs_in, verdict.test) for verdict in alive} == {("element", None)}

@@ -207,8 +207,14 @@ def judge(original: Original, mutant: Mutant, seed: int = 0) -> Verdict:
     if comparison.status == "equal":
         return Verdict("equivalent", "a proof")
     distinction = comparison.distinction
-    if distinction is None or distinction.draws:  # a test needs a seed
-        return Verdict("survived", differs_in=distinction.slot if distinction else None)
+    if distinction is None:
+        return Verdict("survived")
+    usual = {param.name: float(param.default) for param in original.ruleset.params}
+    given = distinction.sample.params.items()
+    if distinction.draws or any(
+        usual[name] != value for name, (value,) in given
+    ):  # tests need seeds, set none
+        return Verdict("survived", differs_in=distinction.slot)
     test = written_test(mutant, distinction, original.sim, original.packs)
     return Verdict("survived", differs_in=distinction.slot, test=test)
 
