@@ -14,12 +14,13 @@ from collections.abc import Collection, Generator, Iterable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache, partial
 from itertools import cycle
 from math import inf
 from multiprocessing import active_children, get_context, parent_process
 from pathlib import Path
+from string import ascii_letters
 from textwrap import indent
 from threading import Thread
 from typing import Any, ClassVar, Self
@@ -27,8 +28,9 @@ from typing import Any, ClassVar, Self
 import numpy as np
 
 from powderdsl.analysis.proofs import horizon
-from powderdsl.compiler import read
+from powderdsl.compiler import lower, read
 from powderdsl.diagnostics import CompileError, Diagnostic, Reporter, Severity, Source
+from powderdsl.ir.text import structure
 from powderdsl.model.check import check
 from powderdsl.model.composition.names import needs_of, with_stand_ins
 from powderdsl.model.declarations import PackDecl, RulesetDecl, read_file
@@ -41,7 +43,6 @@ from powderdsl.syntax.yaml_tree import Sequence as YamlSequence
 from powderdsl.syntax.yaml_tree import parse_yaml
 from powderdsl.system.cache import Memo
 from powderdsl.system.interrupts import delay_signal
-from powderdsl.system.settings import fingerprint
 from powderdsl.system.writing import write_text
 from powderdsl.testing.mutation.operators import Mutant, mutants_of
 from powderdsl.testing.pack_tests.runner import ANYTHING, SEEDS, field_rows, run_examples
@@ -64,6 +65,7 @@ class Original:
     declaration: RulesetDecl | None
     ruleset: Ruleset
     warnings: Counter[str]
+    memo: Memo = field(default_factory=Memo)
 
     @classmethod
     def of(cls, rules: str, settings: Settings = ()) -> Original:
@@ -88,19 +90,14 @@ class Original:
         some = {frozenset(needs[pack]), frozenset(needs[pack]).union(*map(needs.__getitem__, named))}
         for names in sorted(some - {frozenset(needs)}, key=len):
             files = (decl.source.name for decl in self.packs if decl.name.text in names)
-            settings = tuple(item for item in self.settings if item[0].partition(".")[0] in names)
-            with suppress(CompileError):
-                loaded.append(Original.of("+".join(files), settings))
+            with suppress(CompileError):  # as where a setting is another pack's
+                loaded.append(Original.of("+".join(files), self.settings))
         return loaded
 
     def mutants(self, only: frozenset[str] = frozenset()) -> list[Mutant]:
         """The mutants of all packs, or of some, in the order of the packs and their files."""
-        return [
-            mutant
-            for pack in self.packs
-            if not only or pack.name.text in only
-            for mutant in mutants_of(pack, self.packs)
-        ]
+        packs = [pack for pack in self.packs if not only or pack.name.text in only]
+        return [mutant for pack in packs for mutant in mutants_of(pack, self.packs)]
 
     def mutated(self, mutant: Mutant) -> tuple[Ruleset, Counter[str]] | None:
         """The model with the mistake and its warnings. None if its text is no rule file; raises CompileError."""
@@ -116,7 +113,7 @@ class Original:
     @cached_property
     def sim(self) -> Simulator:
         """Runs it. Simulators of mutants are made from it, and compile only the passes that differ."""
-        return compile(self.ruleset, starting_backend("cpu"), tensors=False, memo=Memo())
+        return compile(self.ruleset, starting_backend("cpu"), tensors=False, memo=self.memo)
 
     @lru_cache(maxsize=1000)  # noqa: B019
     def holds(self, name: str) -> bool:
@@ -125,8 +122,8 @@ class Original:
         return all(result.passed for result in run_examples(replace(self.ruleset, tests=tests), sim=self.sim))
 
     @cached_property
-    def fingerprint(self) -> str:
-        return fingerprint(self.ruleset)
+    def meaning(self) -> tuple[object, object]:
+        return meaning_of(self.ruleset, self.memo)
 
     @cached_property
     def broken(self) -> frozenset[str]:
@@ -138,6 +135,14 @@ class Original:
 
 def warnings_of(diagnostics: tuple[Diagnostic, ...]) -> Counter[str]:
     return Counter(diagnostic.code for diagnostic in diagnostics if diagnostic.severity is Severity.WARNING)
+
+
+def meaning_of(ruleset: Ruleset, memo: Memo) -> tuple[object, object]:
+    """What decides how a composition behaves, and what its tests and invariants say of that."""
+    program, values = lower(ruleset, memo), [prop.values for prop in ruleset.properties]
+    passes = [structure(pass_, places=False) for pass_ in program.passes]
+    parts = program.slots, program.params, program.streams, passes
+    return parts, (ruleset.invariants, ruleset.tests, values)
 
 
 # Verdicts
@@ -169,10 +174,7 @@ class Verdict:
 
 
 def judge(original: Original, mutant: Mutant, seed: int = 0) -> Verdict:
-    """Hold a mutant against everything that its composition says about itself, cheapest first.
-
-    Tests run in the parts of the composition before it is loaded as a whole.
-    """
+    """Hold a mutant against all that its composition says about itself, cheapest first: tests run in parts of it before."""
     for part in original.parts(mutant.pack):
         with suppress(CompileError):  # it may be about another pack
             mutated = part.mutated(mutant)
@@ -189,15 +191,15 @@ def judge(original: Original, mutant: Mutant, seed: int = 0) -> Verdict:
     ruleset, warnings = mutated
     if new := warnings - original.warnings:
         return Verdict("killed", "check", min(new))
-    if fingerprint(ruleset) == original.fingerprint:
-        return Verdict("equivalent", "the same model")
+    meaning = meaning_of(ruleset, original.memo)
+    if meaning == original.meaning:
+        return Verdict("equivalent", "the same program")
     sim, focus = original.sim.of(ruleset), focused(original, mutant)
     if failed := failed_test(original, sim, mutant.pack, quick=True):
         return failed
     comparison = compare(original.sim, sim, PROOF / 10, focus, seed)
-    said, before = ((r.invariants, [p.values for p in r.properties]) for r in (ruleset, original.ruleset))
-    different = comparison.status != "equal" or said != before  # otherwise it breaks what the original breaks
-    if different and (broken := broken_invariant(original, sim)):
+    same = comparison.status == "equal" and meaning[1] == original.meaning[1]
+    if not same and (broken := broken_invariant(original, sim)):
         return Verdict("killed", "invariant", broken.text)
     if comparison.status != "equal":
         if failed := failed_test(original, sim, mutant.pack, quick=False):
@@ -273,9 +275,9 @@ def broken_invariant(original: Original, sim: Simulator) -> Property | None:
     samples = random_samples(sim.ruleset, search.plan.seed, search.plan.examples) if search.trials else ()
     for sample, steps in zip(samples, cycle(STEPS), strict=False):
         search.try_sample(sample, steps)
-        broken = next((trial.prop for trial in search.trials if trial.sample is not None), None)
-        if broken is not None:
-            return broken
+        for trial in search.trials:
+            if trial.sample is not None:
+                return trial.prop
     return None
 
 
@@ -369,11 +371,10 @@ def focused(original: Original, mutant: Mutant) -> tuple[int, ...]:
     """Elements that a mutant is likely to be about: its lines name them, one of their tags or a set."""
     words = set(re.findall(r"\w+", mutant.diff))
     tags = words & {tag.name.text for pack in original.packs for tag in pack.tags}
-    own = {element.name for element in original.ruleset.elements if element.pack == mutant.pack}
     return tuple(
         element.id
         for element in original.ruleset.elements
-        if element.name in words or element.tags & tags or element.name in own
+        if element.name in words or element.tags & tags or element.pack == mutant.pack
     )
 
 
@@ -395,8 +396,6 @@ def noticed_share(counts: dict[str, int]) -> float:
 
 GENERATED = "generated "
 """How names of tests begin that the tool has written: they are counted apart from those written by hand."""
-
-LETTERS = "abcdefghijklmnopqrstuvwxyzABCDEFGHIJKLMNOPQRSTUVWXYZ0123456789"
 
 
 @dataclass(frozen=True)
@@ -428,8 +427,8 @@ def written_test(
     maybe = {name: "?" * (pack not in needed) for name, pack in homes.items()}
     glyphs, legend = _legend(there, ruleset, packs, needed)
     digest = hashlib.sha256(re.sub(r":\d+", "", mutant.key).encode()).hexdigest()[:6]
-    name = f"{GENERATED}{digest} against {mutant.operator} in {_where(mutant)}"
-    lines = [f"- {name}:"]
+    title = f"{GENERATED}{digest} against {mutant.operator} in {_where(mutant)}"
+    lines = [f"- {title}:"]
     if legend:
         quoted = [(glyph if glyph.isalpha() else f'"{glyph}"', element) for glyph, element in legend]
         items = ", ".join(f"{glyph}: {element}" for glyph, element in quoted)
@@ -437,11 +436,11 @@ def written_test(
     lines += ["    given: |", *_drawn(before, glyphs)]
     start = run_sample(sim, distinction.sample, 0)[1]
     usual = sim.world(distinction.sample.ids)
-    for field in distinction.sample.fields:
-        words = _words(field, start, usual.state[field][0], start.state[field][0], ".")
+    for name in distinction.sample.fields:
+        words = _words(name, start, usual.state[name][0], start.state[name][0], ".")
         if words:
             lines += ["    fields:"] if "    fields:" not in lines else []
-            lines += [f"      {field}{maybe[field]}: |", *words]
+            lines += [f"      {name}{maybe[name]}: |", *words]
     lines.append(f"    after: {distinction.steps} step{'' if distinction.steps == 1 else 's'}")
     if distinction.slot == "element":
         lines += ["    expect: |", *_drawn(wanted, glyphs)]
@@ -452,7 +451,7 @@ def written_test(
         lines += ["    expect_fields:", f"      {slot}{maybe[slot]}: |", *words]
     if seed is not None:
         lines.append(f"    seed: {seed}")
-    return GeneratedTest(mutant.pack, name, "\n".join(lines) + "\n")
+    return GeneratedTest(mutant.pack, title, "\n".join(lines) + "\n")
 
 
 def _words(field: str, world: World, first: Any, second: Any, filler: str) -> list[str]:
@@ -492,7 +491,7 @@ def _legend(
             glyphs[element.id] = element.glyph
             continue
         taken = {*glyphs.values(), *known.values(), *"?\"'\\#"}
-        wanted = [element.glyph, *element.name, *element.name.upper(), *LETTERS]
+        wanted = [element.glyph, *element.name, *element.name.upper(), *ascii_letters]
         glyphs[element.id] = next(glyph for glyph in wanted if glyph not in taken)
         legend.append((glyphs[element.id], element.name if element.pack in needed else f"{element.name}?"))
     return glyphs, legend
