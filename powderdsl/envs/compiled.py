@@ -121,21 +121,11 @@ class CompiledEnv(TensorEnv):
         if status == EMPTY:
             stepper.fill(self._numbers)
             stepper.begin()
-        ended = results.ended
-        info: dict[str, Any] = {
-            "success": results.success,
-            "_success": active,
-            "episode_return": results.episode_return,
-            "episode_length": results.episode_length,
-            "_episode_return": ended,
-            "_episode_length": ended,
-            "world": results.world,
-            "_world": results.everyone,
-        }
+        info, ended = dict(results.info), results.ended
+        if mode is AutoresetMode.NEXT_STEP:
+            info["_success"] = active
         if results.last_observed is not None:
-            names = ("success", "episode_return", "episode_length")
-            final = {"world": results.last_world, **{name: info[name] for name in names}}
-            info["final_info"] = final | {f"_{name}": ended for name in final}
+            info["final_info"] = dict(results.final_info)
             info["final_obs"] = results.last_observed[: np.count_nonzero(ended)]
             info["_final_obs"] = info["_final_info"] = ended
         if self.shows_mask:

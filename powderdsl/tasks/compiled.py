@@ -80,6 +80,19 @@ class Results:
         self.everyone = np.ones(worlds, np.bool_)
         self.observed = np.empty((worlds, *shape), dtype)
         self.last_observed = np.empty((worlds, *shape), dtype) if keeps_last else None
+        names = ("success", "episode_return", "episode_length")
+        self.final_info: dict[str, Any] = {
+            "world": self.last_world,
+            **{name: getattr(self, name) for name in names},
+        }
+        self.final_info |= {f"_{name}": self.ended for name in self.final_info}
+        """What is said of episodes that have ended."""
+        self.info: dict[str, Any] = {
+            **{name: getattr(self, name) for name in (*names, "world")},
+            **dict.fromkeys(("_episode_return", "_episode_length"), self.ended),
+            **dict.fromkeys(("_success", "_world"), self.everyone),
+        }
+        """What is said of all."""
         self._arrays = [memory, *rows, self.everyone, self.observed]
         if self.last_observed is not None:
             self._arrays.append(self.last_observed)

@@ -194,11 +194,17 @@ static void look(Context& c) {
 }
 static void run_group(Context& c, Batch& b, int number, long steps, const Clocks& k, const uint8_t* planes, const float* reals) {
   c.lanes = std::min(LANES, b.lanes() - number * LANES);
-  for (int l = 0; l < LANES; l++) {
-    const int world = c.worlds[l] = (number * LANES + std::min(l, c.lanes - 1)) / c.g.strips;
-    for (int i = 0; i < PARAM_PLANES; i++) c.param_bits[i][l] = planes[(size_t)i * b.worlds + world] ? FULL : 0;
-    for (int i = 0; i < PARAM_REALS; i++) c.param_real[i][l] = reals[(size_t)i * b.worlds + world];
+  for (int l = 0; l < LANES; l++) c.worlds[l] = (number * LANES + std::min(l, c.lanes - 1)) / c.g.strips;
+  const int others = c.worlds[LANES - 1] - c.worlds[0];
+  for (int i = 0; i < PARAM_PLANES; i++) {
+    const uint8_t* bits = planes + (size_t)i * b.worlds;
+    const uint8_t* first = bits + c.worlds[0];
+    c.param_bits[i] = splat(*first ? FULL : 0);
+    if (memcmp(first, first + 1, others))  // mostly, all worlds have the same
+      for (int l = 0; l < LANES; l++) c.param_bits[i][l] = bits[c.worlds[l]] ? FULL : 0;
   }
+  for (int i = 0; i < PARAM_REALS; i++)
+    for (int l = 0; l < LANES; l++) c.param_real[i][l] = reals[(size_t)i * b.worlds + c.worlds[l]];
   for (int i = 0; i < 2; i++)
     by_hash(c.world_keys[i], [&](int l) {
       const int world = c.worlds[l];
