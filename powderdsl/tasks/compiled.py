@@ -265,7 +265,7 @@ class Stepper(Plan):
         }
         for name, tensor in self._tensors.items():
             setattr(self.play, name, tensor.data_ptr())
-        self.play.batch, self._params = state.handle, params
+        self._params = params
         self.play.mask_words, self.play.own_masks = masks.words[0].numel(), self.program.meter.own
         return self.episodes
 
@@ -281,7 +281,7 @@ class Stepper(Plan):
         has changed; or READY or EMPTY.
         """
         library, play, address = self.native.library, self._play, self._numbers_at
-        self.episodes.world.state.forget()  # type: ignore[attr-defined]
+        self._state().forget()
         if not self.measures_cells:
             status = int(library.pd_play(play, address))
             if status == READY:
@@ -301,9 +301,15 @@ class Stepper(Plan):
 
     def begin(self) -> None:
         """Begin the next episodes where `begins` says so, and write observations."""
-        self.episodes.world.state.forget()  # type: ignore[attr-defined]
+        self._state().forget()
         self.native.library.pd_begin(self._play)
         self._copy_maps()
+
+    def _state(self) -> PackedState:
+        """Return the worlds that the library writes to. Raises RuntimeError if someone has stepped them with `reuse`."""
+        state: PackedState = self.episodes.world.state  # type: ignore[assignment]
+        self.play.batch = state.handle
+        return state
 
     def _own(self, regions: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """Return the regions that each world has of its own."""

@@ -239,3 +239,12 @@ def test_results_that_are_held_stay(mode):
         del observed, reward, info
     assert all((array == copy).all() for array, copy in held)
     assert len(memory) < 30
+
+
+def test_worlds_that_others_have_stepped_are_refused():
+    _, env = both(load_task("sand-pushing"), 3)
+    env.reset(seed=1)
+    env.step([[0] * 5] * 3)
+    env.simulator.step(env.episodes.world, reuse=True)
+    with pytest.raises(RuntimeError, match="reuse"):
+        env.step([[0] * 5] * 3)
