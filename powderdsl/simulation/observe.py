@@ -51,8 +51,8 @@ class Observer:
         self.ruleset = ruleset
         self.device = torch.empty(0, device=device).device  # with its number
         self.slots: dict[str, Slot] = {slot.name: slot for slot in slots(ruleset)}
-        self._views: dict[tuple[str, int], tuple[NativeProgram, Views]] = {}
-        """By kind and number of cells; of the program that ran last."""
+        self._views: dict[tuple[str, int, int], tuple[NativeProgram, Views]] = {}
+        """By kind, number of cells and bytes of a pixel; of the program that ran last."""
 
     @torch.no_grad()
     def read(self, state: State, name: str, out: Any = None) -> Tensor:
@@ -62,12 +62,16 @@ class Observer:
         return _write_slot(state, name, self.buffer(out, shape, getattr(torch, slot.dtype)))
 
     @torch.no_grad()
-    def rgb(self, state: State, out: Any = None) -> Tensor:
-        """Pictures uint8 [B, H, W, 3], a pixel a cell, in the elements' colors, which may follow fields; then tints."""
-        out, shown = self.buffer(out, (*shape_of(state), 3), torch.uint8), self._looks
-        if not isinstance(state, PackedState):
-            return out.copy_(rgb(state["element"], fields=state, kind=Tensors(self.device), **shown))
-        return self._show("rgb", state, out)
+    def rgb(self, state: State, out: Any = None, *, size: int = 3) -> Tensor:
+        """Pictures uint8 [B, H, W, size], a pixel a cell, in the elements' colors, which may follow fields; then tints.
+
+        Only the first three bytes of a pixel are written.
+        """
+        out, shown = self.buffer(out, (*shape_of(state), size), torch.uint8), self._looks
+        if isinstance(state, PackedState):
+            return self._show("rgb", state, out, size)
+        out[..., :3] = rgb(state["element"], fields=state, kind=Tensors(self.device), **shown)
+        return out
 
     @torch.no_grad()
     def matrix(self, state: State, out: Any = None) -> Tensor:
@@ -107,8 +111,11 @@ class Observer:
             out[:, place] = pack((state[name] >> bit) & 1 != 0)
         return out
 
-    def views(self, kind: str, program: Places, cells: int) -> Views:
-        """Return what native code writes for ``ids`` or a method's observations, for worlds of a number of cells."""
+    def views(self, kind: str, program: Places, cells: int, size: int = 3) -> Views:
+        """Return what native code writes for ``ids`` or a method's observations, for worlds of a number of cells.
+
+        `size`: bytes of a pixel.
+        """
         views, homes = Views(), program.homes
         ids = homes["element"][:2]
         match kind:
@@ -116,14 +123,15 @@ class Observer:
                 views.add("values", *ids, 0, 1)
             case "rgb":
                 shown = self._looks
-                views.add("colors", *ids, tables=[shown["colors"]])
+                views.add("colors", *ids, number=size, tables=[shown["colors"]])
                 for ramp in shown["ramps"]:
                     field = homes[ramp.field]
                     numbers = *ids, ramp.id, int(not field[1]), *map(int, field), len(ramp.starts)
-                    views.add("ramp", *numbers, tables=[ramp.colors, ramp.starts])
+                    views.add("ramp", *numbers, number=size, tables=[ramp.colors, ramp.starts])
                 for tint in shown["tints"]:
                     parts = (homes[piece.slot][0] for piece in program.pieces[tint.field])
-                    views.add("tint", *parts, tables=[torch.tensor([*tint.color, tint.full, tint.most])])
+                    look = torch.tensor([*tint.color, tint.full, tint.most])
+                    views.add("tint", *parts, number=size, tables=[look])
             case "matrix":
                 channels, tables = self._channels
                 rows = [_native_channel(channel, at, homes) for at, channel in enumerate(channels)]
@@ -140,12 +148,12 @@ class Observer:
                 views.add("planes", len(places), tables=[torch.tensor(places, dtype=torch.int32)])
         return views
 
-    def _show(self, kind: str, state: PackedState, out: Tensor) -> Tensor:
+    def _show(self, kind: str, state: PackedState, out: Tensor, size: int = 3) -> Tensor:
         """Write an observation of packed worlds into `out`; returns it."""
         cells = prod(shape_of(state)[1:])
-        key = kind, cells
+        key = kind, cells, size
         if key not in self._views or self._views[key][0] is not state.program:
-            self._views[key] = state.program, self.views(kind, state.program, cells)
+            self._views[key] = state.program, self.views(kind, state.program, cells, size)
         return state.show(self._views[key][1], out)
 
     @cached_property

@@ -106,6 +106,10 @@ def test_worlds_are_drawn_alike_everywhere(backend: str, torch) -> None:  # type
             now.rgb(buffer[1:4])
             assert np.array_equal(buffer[1:4].numpy(), picture)
             assert bool((buffer[0] == 77).all() & (buffer[4] == 77).all())
+            wide = torch.full((5, height, width, 6), 77, dtype=torch.uint8)
+            sim.observer.rgb(now.state, wide[1:4], size=6)
+            assert np.array_equal(wide[1:4, ..., :3].numpy(), picture)
+            assert bool((wide[[0, 4]] == 77).all() & (wide[..., 3:] == 77).all())
     assert (picture != plain).any()
 
 

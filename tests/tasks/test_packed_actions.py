@@ -11,6 +11,7 @@ from powderdsl.envs.tensor_env import observation_of
 from powderdsl.simulation.simulator import compile as compile_rules
 from powderdsl.tasks.episodes import compile_task
 from powderdsl.tasks.file import read_task
+from powderdsl.tasks.tensors.actions import put_worlds, take_worlds
 
 TASK = """task: packed
 rules: powderworld
@@ -132,3 +133,25 @@ def test_spent_worlds_are_refused(torch):
     for read in (lambda: world.ids, lambda: native.step(world), world.rgb):
         with pytest.raises(RuntimeError, match="reuse"):
             read()
+
+
+@pytest.mark.parametrize("size", ["[32, 32]", "[64, 64]", "[24, 70]", "[9, 19]"])
+def test_packed_worlds_are_taken_put_and_compared_without_unpacking(torch, size):
+    task = read_task(Source("packed.yaml", TASK.replace("SIZE", size)), Reporter())
+    program = compile_task(task, backend="native")
+    for batch in (3, 40):
+        world = program.simulator.step(program.start(torch.arange(batch)).world, 2)
+        cells, places = dict(world.state.items()), torch.tensor([2, 0])
+        part = take_worlds(world, places)
+        assert part.step.tolist() == world.step[places].tolist()
+        for name, value in cells.items():
+            assert torch.equal(part.state[name], value[places]), name
+        after = put_worlds(world, places.flip(0), part, reuse=False)
+        for name, value in cells.items():
+            value[[0, 2]] = value[[2, 0]]
+            assert torch.equal(after.state[name], value), name
+        ids, goals = after.ids, after.ids.roll(1, 0)
+        matched = ids == goals
+        for axis, by in ((1, 1), (1, -1), (2, 1), (2, -1)):
+            matched |= ids.roll(by, axis) == goals
+        assert after.state.missed(goals).tolist() == (~matched).sum((1, 2)).tolist()

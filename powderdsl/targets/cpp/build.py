@@ -298,6 +298,8 @@ SIGNATURES = {
     "pd_put": "- piiipip",
     "pd_fill": "- piipp",
     "pd_show": "- pippl",
+    "pd_missed": "- piipp",
+    "pd_take": "- ppppi",
     "pd_act": "l pp",
     "pd_finish": "i p",
     "pd_begin": "- p",

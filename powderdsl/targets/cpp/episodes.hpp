@@ -40,6 +40,10 @@ static void copy_world(Batch& to, int at, const Batch& from, int source) {
     }
   }
 }
+// The worlds `places` of a batch become the worlds `sources` of another; null: 0, 1, ….
+API void pd_take(void* to, const int64_t* places, const void* from, const int64_t* sources, int count) {
+  for (int k = 0; k < count; k++) copy_world(*(Batch*)to, places ? places[k] : k, *(const Batch*)from, sources ? sources[k] : k);
+}
 
 struct Op {
   int64_t op, number;

@@ -171,6 +171,22 @@ class PackedState(OwnedBatch):
                 self.program.library.pd_fill(changed.handle, slot, bits, numbers.data_ptr(), boxes.data_ptr())
         return changed
 
+    def select(self, places: Tensor) -> PackedState:
+        """The worlds `places`, int64 [n], as a new state."""
+        rows, library, places = len(places), self.program.library, places.contiguous()
+        like = {name: (dtype, (rows, *shape[1:])) for name, (dtype, shape) in self.like.items()}
+        taken = PackedState(self.program, library.pd_new(rows, *shape_of(self)[1:]), like)
+        library.pd_take(taken.handle, None, self.handle, places.data_ptr(), rows)
+        return taken
+
+    def missed(self, goals: Tensor) -> Tensor:
+        """How many cells of goals, uint8 [B, H, W], have their element neither there nor beside it: int64 [B]."""
+        counts, (slot, bits, _) = torch.empty(len(goals), dtype=torch.int64), self.program.homes["element"]
+        self.program.library.pd_missed(
+            self.handle, slot, bits, goals.contiguous().data_ptr(), counts.data_ptr()
+        )
+        return counts
+
     def put(self, places: Tensor, state: Mapping[str, Tensor], *, reuse: bool) -> PackedState:
         """The state with the worlds `places`, int64 [n], replaced by those of another state of n worlds.
 
@@ -179,6 +195,9 @@ class PackedState(OwnedBatch):
         changed, places = self if reuse else self.__copy__(), places.contiguous()
         changed._arrays.clear()
         put, count, at = self.program.library.pd_put, len(places), places.data_ptr()
+        if isinstance(state, PackedState) and state.program is self.program:
+            self.program.library.pd_take(changed.handle, at, state.handle, None, count)
+            return changed
         for name, value in state.items():
             for part, slot, bits, _ in self.program.parts(name, value):
                 cells = part.contiguous()

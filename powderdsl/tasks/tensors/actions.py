@@ -22,6 +22,14 @@ Numbers = Any
 the time."""
 
 
+def take_worlds(world: World, places: Tensor) -> World:
+    """The worlds of numbers `places`, int64 [n], as `World.select` gives them, without unpacking them."""
+    if not isinstance(world.state, PackedState):
+        return world.select(places)
+    clock = {name: getattr(world, name)[places] for name in ("seed", "index", "start")}
+    return world.with_state(world.state.select(places), **clock)
+
+
 def put_worlds(world: World, places: Tensor, part: World, *, reuse: bool) -> World:
     """The worlds with those of numbers `places`, int64 [n], replaced. `reuse` writes into the world's own tensors."""
     if len(places) == len(world):
