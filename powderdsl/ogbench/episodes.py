@@ -26,7 +26,7 @@ from powderdsl.simulation.simulator import Simulator, World, compile
 from powderdsl.system.random import MASK, base_keys, mix, name_number
 from powderdsl.targets.cpp.program import PackedState
 from powderdsl.targets.torch.program import TorchProgram
-from powderdsl.tasks.tensors.actions import Blocks, put_worlds
+from powderdsl.tasks.tensors.actions import Blocks, put_worlds, take_worlds
 
 Numbers = NDArray[np.int64]
 
@@ -81,6 +81,14 @@ class LevelProgram:
         self._covers = (edges[:, 1] > edges[:, 0]).cpu().numpy()
         self.paints = torch.from_numpy(palette(ruleset.elements)[self.ids, :3]).to(self.device)
         """The colors of what agents paint: uint8 [n, 3]."""
+        line = torch.arange(level.side, device=self.device)
+        inside = (line >= first[:, None]) & (line < first[:, None] + level.brush)
+        self._lit = (
+            torch.nn.functional.pad(inside, (0, 0, 1, 0), value=True).byte().mul(255).repeat_interleave(6, 1)
+        )
+        """A line of a frame for each x, behind one for none yet: 255 where it is lit. uint8 [places + 1, 6 W]."""
+        self._colors = torch.nn.functional.pad(self.paints, (3, 0, 1, 0)).repeat(1, level.side)
+        """A lit line of a frame for each element, behind one for none yet: uint8 [n + 1, 6 W]."""
 
     def start(self, seeds: Numbers, indices: Numbers) -> World:
         """New worlds. Their draws depend on seed and index, int64 [B] of at least 0 each."""
@@ -111,6 +119,12 @@ class LevelProgram:
         reuse = reuse or packed  # a step makes a packed state of its own
         cells = self.blocks.cells(stepped.state, y, x)
         return stepped.with_state(self.blocks.filled(stepped.state, cells, where, values, reuse=reuse))
+
+    def frames(self, stage: Numbers, element: Numbers, x: Numbers) -> Tensor:
+        """A line of each action frame, as observations have it: uint8 [B, 1, 6 W]. All are int64 [B]."""
+        chosen = np.where(stage > 0, 1 + element, 0), np.where(stage > 1, 1 + x, 0)
+        color, lit = (torch.from_numpy(numbers).to(self.device) for numbers in chosen)
+        return (self._colors.index_select(0, color) & self._lit.index_select(0, lit))[:, None]
 
     def errors(self, ids: Tensor, goals: Tensor) -> Numbers:
         """Cells of goals, uint8 [B, H, W], whose element is neither there in `ids` nor beside it: int64 [B]."""
@@ -253,11 +267,11 @@ class Episodes:
         """The task of each episode, from 1; 0 if it was given from outside."""
         self._chosen = np.zeros((batch, 3), dtype=np.int64)
         self.world: World | None = None
-        self._shown = torch.zeros(batch, side, side, 6, dtype=torch.uint8, device=device)
+        self._pictures = torch.zeros(batch, side, side, 6, dtype=torch.uint8, device=device)
+        """What observations show, without action frames."""
         self.goal_ids = torch.zeros(batch, side, side, dtype=torch.uint8, device=device)
         self.goal_pictures = torch.zeros(batch, side, side, 3, dtype=torch.uint8, device=device)
         self._goals: dict[tuple[int, GoalTask], Goal] = {}
-        self._columns = torch.arange(side, device=device)
 
     # Beginning
 
@@ -288,7 +302,6 @@ class Episodes:
             first = [self._drawn(which, what, self.level.choices(stage)) for stage, what in enumerate(FIRST)]
             fresh = self.program.act(fresh, np.stack(first, 1), self._draws.planes(which))
         self._put(which, fresh)
-        self._show_frames()
 
     def _task(self, place: int, task: int | GoalTask | None) -> GoalTask:
         if task is None:
@@ -360,10 +373,9 @@ class Episodes:
         painting = which[stages == 2]
         if len(painting):
             if len(painting) < self.count:
-                part = part.select(torch.from_numpy(painting).to(self.program.device))
+                part = take_worlds(part, torch.from_numpy(painting).to(self.program.device))
             planes = self._draws.planes(painting)
             self._put(painting, self.program.act(part, self._chosen[painting], planes))
-        self._show_frames()
         return self.success
 
     @property
@@ -379,30 +391,20 @@ class Episodes:
 
     def _put(self, which: Numbers, part: World) -> None:
         """Take up new states of the worlds `which`: what they show, and their errors."""
+        show = part.sim.observer.rgb
         if len(which) == self.count:
             self.world, goals = part, self.goal_ids
-            self._shown[..., :3] = part.rgb()
+            show(part.state, self._pictures, size=6)
         else:
             places = torch.from_numpy(which).to(self.program.device)
-            self._shown[places, :, :, :3] = part.rgb()
+            shown = show(part.state, torch.zeros_like(self._pictures[: len(which)]), size=6)
+            self._pictures.index_copy_(0, places, shown)
             self.world = put_worlds(self._world, places, part, reuse=True)
             goals = self.goal_ids[places]
         if self.mode == "task":
-            self.errors[which] = self.program.errors(part.ids, goals)
-
-    def _show_frames(self) -> None:
-        """Write channels 3 to 5: what has been chosen of the action that is being given."""
-        level, device = self.level, self.program.device
-        stage, element, x = (
-            torch.from_numpy(array).to(device)
-            for array in (self.stage, self._chosen[:, 0], self._chosen[:, 1])
-        )
-        first = (x * level.grid)[:, None]
-        inside = (self._columns >= first) & (self._columns < first + level.brush)
-        lit = (stage == 1)[:, None] | ((stage == 2)[:, None] & inside)
-        color = self.program.paints[element]
-        for channel in range(3):  # one at a time: a pixel's three are too short a row for vectors
-            self._shown[..., 3 + channel] = (lit * color[:, channel, None])[:, None]
+            state = part.state
+            missed = state.missed(goals) if isinstance(state, PackedState) else None
+            self.errors[which] = self.program.errors(part.ids, goals) if missed is None else missed
 
     # Showing
 
@@ -412,7 +414,8 @@ class Episodes:
         Raises ResetNeeded before the first episode.
         """
         assert self._world
-        return self._shown.clone()
+        frames = self.program.frames(self.stage, *self._chosen[:, :2].T)
+        return (self._pictures.flatten(2) | frames).view_as(self._pictures)
 
     def goals(self) -> Tensor:
         """The goals as observations: uint8 [B, H, W, 6]."""

@@ -16,6 +16,7 @@ import powderdsl.ogbench
 from powderdsl.ogbench.env import PowderworldEnv, PowderworldVectorEnv
 from powderdsl.ogbench.episodes import Episodes, LevelProgram
 from powderdsl.ogbench.levels import FOLDER, find_level, read_level, shipped_levels
+from tests.compilers import skip_without_compiler
 
 
 def actions(count: int, worlds: int = 0, seed: int = 0) -> np.ndarray:
@@ -105,14 +106,21 @@ def test_a_batch_plays_the_worlds_of_single_environments(hard: LevelProgram) -> 
     assert begun == 2
 
 
-def test_backends_play_the_same_episodes(easy: LevelProgram) -> None:
-    rows = actions(60, 2)
+@pytest.mark.parametrize("backend", ["torch", "native"])
+def test_backends_play_the_same_episodes(easy: LevelProgram, backend: str) -> None:
+    """Also once stages differ."""
+    skip_without_compiler(backend)
+    rows = actions(60, 3)
     seen = []
-    for program in (easy, LevelProgram(easy.level, backend="torch")):
-        env = PowderworldVectorEnv(program, 2, seed=1)
+    for program in (easy, LevelProgram(easy.level, backend=backend)):
+        env = PowderworldVectorEnv(program, 3, seed=1)
         env.reset(options={"task_id": 3})
-        seen.append(np.stack([env.step(row)[0] for row in rows]))
-    assert (seen[0] == seen[1]).all()
+        frames = [env.step(row)[0] for row in rows[:20]]
+        env.reset(options={"reset_mask": np.array([False, True, False])})
+        frames += [env.step(row)[0] for row in rows[20:]]
+        seen.append((np.stack(frames), env.episodes.errors))
+    assert (seen[0][0] == seen[1][0]).all()
+    assert (seen[0][1] == seen[1][1]).all()
 
 
 def test_a_goal_depends_on_the_seed_and_the_task_alone(hard: LevelProgram) -> None:
