@@ -63,14 +63,12 @@ class Observer:
 
     @torch.no_grad()
     def rgb(self, state: State, out: Any = None, *, size: int = 3) -> Tensor:
-        """Pictures uint8 [B, H, W, size], a pixel a cell, in the elements' colors, which may follow fields; then tints.
-
-        Only the first three bytes of a pixel are written.
-        """
+        """Pictures uint8 [B, H, W, 3 to 8], in colors that may follow fields, then tinted. The other bytes are 0."""
         out, shown = self.buffer(out, (*shape_of(state), size), torch.uint8), self._looks
         if isinstance(state, PackedState):
             return self._show("rgb", state, out, size)
         out[..., :3] = rgb(state["element"], fields=state, kind=Tensors(self.device), **shown)
+        out[..., 3:] = 0
         return out
 
     @torch.no_grad()
@@ -112,10 +110,7 @@ class Observer:
         return out
 
     def views(self, kind: str, program: Places, cells: int, size: int = 3) -> Views:
-        """Return what native code writes for ``ids`` or a method's observations, for worlds of a number of cells.
-
-        `size`: bytes of a pixel.
-        """
+        """Return what native code writes for ``ids`` or a method's observations, of so many cells and bytes a pixel."""
         views, homes = Views(), program.homes
         ids = homes["element"][:2]
         match kind:
@@ -127,11 +122,10 @@ class Observer:
                 for ramp in shown["ramps"]:
                     field = homes[ramp.field]
                     numbers = *ids, ramp.id, int(not field[1]), *map(int, field), len(ramp.starts)
-                    views.add("ramp", *numbers, number=size, tables=[ramp.colors, ramp.starts])
+                    views.add("ramp", *numbers, tables=[ramp.colors, ramp.starts])
                 for tint in shown["tints"]:
                     parts = (homes[piece.slot][0] for piece in program.pieces[tint.field])
-                    look = torch.tensor([*tint.color, tint.full, tint.most])
-                    views.add("tint", *parts, number=size, tables=[look])
+                    views.add("tint", *parts, tables=[torch.tensor([*tint.color, tint.full, tint.most])])
             case "matrix":
                 channels, tables = self._channels
                 rows = [_native_channel(channel, at, homes) for at, channel in enumerate(channels)]

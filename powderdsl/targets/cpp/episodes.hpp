@@ -256,7 +256,7 @@ static double value_of(const Play& p, const Formula& formula, int world, double*
   return *top;
 }
 static void observe(const Play& p, const Batch& b, int first, int last) {
-  for (int i = 0; i < p.views; i++) show(b, lanes_of(b, first, last), p.view[i], p.observed, p.size);
+  show(b, lanes_of(b, first, last), p.view, p.views, p.observed, p.size);
 }
 static int64_t drawn_world(const Play& p, int i) {  // as world_seeds of envs/tensor_env.py
   const u64 base = p.base[i];

@@ -105,24 +105,14 @@ API void pd_store(const void* batch, int slot, int bits, int negative, int item,
   store(b, lanes_of(b, 0, b.worlds), slot, bits, negative, item, data, apart);
 }
 
-// Pictures of `size` bytes a pixel, of which the first three are written: `palette` has red, green and blue of each number
-// in its three low bytes.
-static void show_rgb(const Batch& b, Lanes some, int slot, int bits, const u32* palette, int size, uint8_t* data, int64_t apart) {
-  for (int lane = some.first; lane < some.last; lane++) {
-    Planes p = planes_of(b.groups[lane / LANES], slot, bits, 0);
-    uint8_t* out = data + b.at(lane, apart, size * b.g.width);
-    each_run(b.g, [&](int i, int cell, int count) {
-      uint8_t ids[64];
-      cells_of(p, lane % LANES, i, ids);
-      uint8_t* pixel = out + size * (size_t)cell;
-      if (size > 3) {
-        for (int x = 0; x < count; x++, pixel += size) memcpy(pixel, palette + ids[x], 3);
-        return;
-      }
-      for (int x = 0; x < count - 1; x++, pixel += 3) memcpy(pixel, palette + ids[x], 4);  // the next mends the fourth
-      memcpy(pixel, palette + ids[count - 1], 3);
-    });
-  }
+// Pictures of one lane, row by row: red, green and blue of each cell in the three low bytes.
+static void paint_ids(const Batch& b, int lane, int slot, int bits, const u32* palette, u32* picture) {
+  Planes p = planes_of(b.groups[lane / LANES], slot, bits, 0);
+  each_run(b.g, [&](int i, int cell, int count) {
+    uint8_t ids[64];
+    cells_of(p, lane % LANES, i, ids);
+    for (int x = 0; x < count; x++) picture[cell + x] = palette[ids[x]];
+  });
 }
 
 // A field of reals of a world.
@@ -137,71 +127,60 @@ static void store_real(const Grid& g, const Field* f, int lane, float* out) {
 // Cells of the element `id` in pictures, in the color of their field: row k of `colors` for values that reach k of the
 // ascending `starts`.
 template <class T, class Values>
-ALWAYS void ramp_world(const Planes& ids, int id, int lane, const Grid& g, const T* starts, int count, const u32* colors, int size, uint8_t* out, Values values_of) {
+ALWAYS void ramp_world(const Planes& ids, int id, int lane, const Grid& g, const T* starts, int count, const u32* colors, u32* picture, Values values_of) {
   each_run(g, [&](int i, int cell, int cells) {
     uint8_t found[64];
     cells_of(ids, lane, i, found);
     if (!memchr(found, id, cells)) return;
     const T* values = values_of(i, cell);
     for (int x = 0; x < cells; x++)
-      if (found[x] == id) memcpy(out + size * (size_t)(cell + x), colors + (std::upper_bound(starts, starts + count, values[x]) - starts), 3);
+      if (found[x] == id) picture[cell + x] = colors[std::upper_bound(starts, starts + count, values[x]) - starts];
   });
 }
-static void show_ramp(const Batch& b, Lanes some, int slot, int bits, int id, int is_real, int field, int field_bits, int negative, int count,
-                  const void* starts, const u32* colors, int size, uint8_t* data, int64_t apart) {
+static void paint_ramp(const Batch& b, int lane, int slot, int bits, int id, int is_real, int field, int field_bits, int negative, int count,
+                  const void* starts, const u32* colors, u32* picture) {
   const Grid& g = b.g;
-  std::vector<float> row(is_real ? (size_t)g.height * g.width : 0);
-  for (int lane = some.first; lane < some.last; lane++) {
-    const Group& group = b.groups[lane / LANES];
-    Planes ids = planes_of(group, slot, bits, 0);
-    uint8_t* out = data + b.at(lane, apart, size * g.width);
-    if (is_real) {
-      store_real(g, group.real[field], lane % LANES, row.data());
-      ramp_world(ids, id, lane % LANES, g, (const float*)starts, count, colors, size, out, [&](int, int cell) { return row.data() + cell; });
-    } else {
-      Planes values = planes_of(group, field, field_bits, negative);
-      int32_t part[64];
-      ramp_world(ids, id, lane % LANES, g, (const int32_t*)starts, count, colors, size, out, [&](int i, int) {
-        cells_of(values, lane % LANES, i, (u32*)part);
-        return (const int32_t*)part;
-      });
-    }
+  const Group& group = b.groups[lane / LANES];
+  Planes ids = planes_of(group, slot, bits, 0);
+  if (is_real) {
+    std::vector<float> row((size_t)g.height * g.width);
+    store_real(g, group.real[field], lane % LANES, row.data());
+    ramp_world(ids, id, lane % LANES, g, (const float*)starts, count, colors, picture, [&](int, int cell) { return row.data() + cell; });
+  } else {
+    Planes values = planes_of(group, field, field_bits, negative);
+    int32_t part[64];
+    ramp_world(ids, id, lane % LANES, g, (const int32_t*)starts, count, colors, picture, [&](int i, int) {
+      cells_of(values, lane % LANES, i, (u32*)part);
+      return (const int32_t*)part;
+    });
   }
 }
 
 // Cells in pictures, tinted by vectors: toward a color in 0..1, by the length / `full`, at most by `most`. `numbers` has the
 // color, `full` and `most`. As `tint_cells` in simulation/draw.py, operation by operation.
-static void show_tint(const Batch& b, Lanes some, int row, int column, const float* numbers, int size, uint8_t* data, int64_t apart) {
+static void paint_tint(const Batch& b, int lane, int row, int column, const float* numbers, u32* picture) {
   const Grid& g = b.g;
   const F full = splatf(numbers[3]), most = splatf(numbers[4]);
   const std::vector<float> nothing(g.stride + CHUNK, 0.f);
-  for (int lane = some.first; lane < some.last; lane++) {
-    const Field* parts[2] = {b.groups[lane / LANES].real[row], b.groups[lane / LANES].real[column]};
-    uint8_t* out = data + b.at(lane, apart, size * g.width);
-    for (int y = 0; y < g.height; y++, out += size * g.width) {
-      const size_t line = (size_t)(lane % LANES) * g.height + y;
-      const float* in[2];
-      for (int k = 0; k < 2; k++) in[k] = parts[k]->live[line] ? parts[k]->data + line * g.stride + HALO : nothing.data();
-      if (in[0] == in[1]) continue;  // both are zero
-      for (int x = 0; x < g.width; x += CHUNK) {
-        const F down = load(in[0], x), right = load(in[1], x);
-        const F share = smaller(root(down * down + right * right) / full, most), rest = 1.0f - share;
-        if (!bits_lt(splatf(0), share)) continue;
-        const int last = std::min(CHUNK, g.width - x) - 1;
-        uint8_t* pixel = out + size * x;
-        alignas(VECTOR) u32 colors[CHUNK] = {};
-        for (int i = 0; i < last; i++) memcpy(colors + i, pixel + size * i, 4);
-        memcpy(colors + last, pixel + size * last, 3);
-        const U before = *(const U*)colors;
-        U after = before & 0xff000000u;  // three bytes a pixel: of the next one, which mends it
-        for (int c = 0; c < 3; c++) {
-          const F part = __builtin_convertvector((I)(before >> 8 * c & 255u), F);
-          after |= (U)__builtin_convertvector((part / 255.f * rest + share * numbers[c]) * 255.f, I) << 8 * c;
-        }
-        *(U*)colors = after;
-        for (int i = 0; i < last; i++) memcpy(pixel + size * i, colors + i, 4);
-        memcpy(pixel + size * last, colors + last, 3);
+  const Field* parts[2] = {b.groups[lane / LANES].real[row], b.groups[lane / LANES].real[column]};
+  for (int y = 0; y < g.height; y++, picture += g.width) {
+    const size_t line = (size_t)(lane % LANES) * g.height + y;
+    const float* in[2];
+    for (int k = 0; k < 2; k++) in[k] = parts[k]->live[line] ? parts[k]->data + line * g.stride + HALO : nothing.data();
+    if (in[0] == in[1]) continue;  // both are zero
+    for (int x = 0; x < g.width; x += CHUNK) {
+      const F down = load(in[0], x), right = load(in[1], x);
+      const F share = smaller(root(down * down + right * right) / full, most), rest = 1.0f - share;
+      if (!bits_lt(splatf(0), share)) continue;
+      const size_t bytes = sizeof(u32) * std::min(CHUNK, g.width - x);
+      U before{}, after{};
+      memcpy(&before, picture + x, bytes);
+#pragma GCC unroll 3
+      for (int c = 0; c < 3; c++) {
+        const F part = __builtin_convertvector((I)(before >> 8 * c & 255u), F);
+        after |= (U)__builtin_convertvector((part / 255.f * rest + share * numbers[c]) * 255.f, I) << 8 * c;
       }
+      memcpy(picture + x, &after, bytes);
     }
   }
 }
@@ -306,16 +285,37 @@ static void show_planes(const Batch& b, Lanes some, int count, const int* slots,
 struct View {
   int kind;  // 0 the values of a slot less a[4], 1 colors, 2 a ramp, 3 a tint, 4 channels, 5 codes of reals, 6 planes
   int a[9];
-  float number;  // a floor, or the bytes of a pixel
+  float number;  // a floor, or the bytes of a pixel, from 3 to 8: red, green, blue, then zeros
   const void *first, *second;
   int64_t offset;
 };
-// `apart`: bytes from one world's memory to the next's.
-static void show(const Batch& b, Lanes some, const View& v, uint8_t* out, int64_t apart) {
+// `apart`: bytes from one world's memory to the next's. A picture is painted by all views.
+static void show_picture(const Batch& b, Lanes some, const View* views, int count, uint8_t* out, int64_t apart) {
+  const int cells = b.g.height * b.g.width, size = (int)views->number;
+  std::vector<u32> picture(cells);
+  for (int lane = some.first; lane < some.last; lane++) {
+    for (const View* v = views; v < views + count; v++) {
+      const int* a = v->a;
+      const u32* colors = (const u32*)v->first;
+      if (v->kind == 1) paint_ids(b, lane, a[0], a[1], colors, picture.data());
+      else if (v->kind == 2) paint_ramp(b, lane, a[0], a[1], a[2], a[3], a[4], a[5], a[6], a[7], v->second, colors, picture.data());
+      else paint_tint(b, lane, a[0], a[1], (const float*)v->first, picture.data());
+    }
+    uint8_t* pixel = out + views->offset + b.at(lane, apart, size * b.g.width);
+    const u32 *color = picture.data(), *end = color + cells;
+    for (; color < end - 2; color++, pixel += size) {
+      const u64 bytes = *color & 0xffffffu;
+      memcpy(pixel, &bytes, 8);  // the next mend what is too much
+    }
+    for (; color < end; color++, pixel += size) {
+      const u64 bytes = *color & 0xffffffu;
+      memcpy(pixel, &bytes, size);
+    }
+  }
+}
+static void show_view(const Batch& b, Lanes some, const View& v, uint8_t* out, int64_t apart) {
   const int* a = v.a;
   uint8_t* data = out + v.offset;
-  const u32* colors = (const u32*)v.first;
-  const int size = (int)v.number;
   switch (v.kind) {
     case 0:
       store(b, some, a[0], a[1], a[2], a[3], data, apart / a[3]);
@@ -324,17 +324,18 @@ static void show(const Batch& b, Lanes some, const View& v, uint8_t* out, int64_
         for (int i = 0; i < b.g.height * b.g.width; i++) cell[i] -= a[4];
       }
       return;
-    case 1: return show_rgb(b, some, a[0], a[1], colors, size, data, apart);
-    case 2: return show_ramp(b, some, a[0], a[1], a[2], a[3], a[4], a[5], a[6], a[7], v.second, colors, size, data, apart);
-    case 3: return show_tint(b, some, a[0], a[1], (const float*)v.first, size, data, apart);
     case 4: return show_channels(b, some, a[0], (const Channel*)v.first, (const float*)v.second, (float*)data, apart / 4);
     case 5: return show_codes(b, some, a[0], a[1], a[2], v.number, data, apart);
     default: return show_planes(b, some, a[0], (const int*)v.first, (u64*)data, apart / 8);
   }
 }
+static void show(const Batch& b, Lanes some, const View* views, int count, uint8_t* out, int64_t apart) {
+  if (count && views->kind == 1) return show_picture(b, some, views, count, out, apart);
+  for (int i = 0; i < count; i++) show_view(b, some, views[i], out, apart);
+}
 API void pd_show(const void* batch, int count, const View* views, uint8_t* out, int64_t apart) {
   const Batch& b = *(const Batch*)batch;
-  for (int i = 0; i < count; i++) show(b, lanes_of(b, 0, b.worlds), views[i], out, apart);
+  show(b, lanes_of(b, 0, b.worlds), views, count, out, apart);
 }
 
 // Cells of goals, [world][row][column], whose number is neither there nor in one of the four cells beside it, around edges.
@@ -351,21 +352,24 @@ API void pd_missed(const void* batch, int slot, int bits, const uint8_t* goals, 
       row[0] = from[width - 1], row[width + 1] = from[0];
       memcpy(row + 1, from, width);
     }
-    counts[i] = 0;
-    for (int y = 0; y < height; y++)
+    int64_t sum = 0;
+    const uint8_t* cell = wide.data() + apart + 1;
+    for (int y = 0; y < height; y++, cell += apart)
       for (int x = 0; x < width; x += 8) {  // eight cells in a word
         const int count = std::min(8, width - x);
-        const uint8_t* cell = wide.data() + (size_t)(y + 1) * apart + 1 + x;
         u64 goal = 0, missed = ~LOW;
         if (count == 8) memcpy(&goal, goals, 8);
         else memcpy(&goal, goals, count), missed >>= 8 * (8 - count);
-        for (int by : {0, -1, 1, -apart, apart}) {
+        const int places[] = {0, -1, 1, -apart, apart};
+#pragma GCC unroll 5
+        for (int k = 0; k < 5; k++) {
           u64 found;
-          memcpy(&found, cell + by, 8);
+          memcpy(&found, cell + x + places[k], 8);
           missed &= (((found ^ goal) & LOW) + LOW) | (found ^ goal);  // the high bit of each byte that differs
         }
-        counts[i] += __builtin_popcountll(missed), goals += count;
+        sum += __builtin_popcountll(missed), goals += count;
       }
+    counts[i] = sum;
   }
 }
 
