@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from itertools import count
+from sys import getrefcount
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -81,13 +82,11 @@ class LevelProgram:
         self._covers = (edges[:, 1] > edges[:, 0]).cpu().numpy()
         self.paints = torch.from_numpy(palette(ruleset.elements)[self.ids, :3]).to(self.device)
         """The colors of what agents paint: uint8 [n, 3]."""
-        line = torch.arange(level.side, device=self.device)
-        inside = (line >= first[:, None]) & (line < first[:, None] + level.brush)
-        self._lit = (
-            torch.nn.functional.pad(inside, (0, 0, 1, 0), value=True).byte().mul(255).repeat_interleave(6, 1)
-        )
+        line, begins = np.arange(level.side), first.cpu().numpy()[:, None]
+        inside = (line >= begins) & (line < begins + level.brush)
+        self._lit = np.repeat(np.vstack([line >= 0, inside]) * np.uint8(255), 6, 1)
         """A line of a frame for each x, behind one for none yet: 255 where it is lit. uint8 [places + 1, 6 W]."""
-        self._colors = torch.nn.functional.pad(self.paints, (3, 0, 1, 0)).repeat(1, level.side)
+        self._colors = np.tile(np.pad(self.paints.cpu().numpy(), ((1, 0), (3, 0))), level.side)
         """A lit line of a frame for each element, behind one for none yet: uint8 [n + 1, 6 W]."""
 
     def start(self, seeds: Numbers, indices: Numbers) -> World:
@@ -120,11 +119,10 @@ class LevelProgram:
         cells = self.blocks.cells(stepped.state, y, x)
         return stepped.with_state(self.blocks.filled(stepped.state, cells, where, values, reuse=reuse))
 
-    def frames(self, stage: Numbers, element: Numbers, x: Numbers) -> Tensor:
+    def frames(self, stage: Numbers, element: Numbers, x: Numbers) -> NDArray[np.uint8]:
         """A line of each action frame, as observations have it: uint8 [B, 1, 6 W]. All are int64 [B]."""
-        chosen = np.where(stage > 0, 1 + element, 0), np.where(stage > 1, 1 + x, 0)
-        color, lit = (torch.from_numpy(numbers).to(self.device) for numbers in chosen)
-        return (self._colors.index_select(0, color) & self._lit.index_select(0, lit))[:, None]
+        colors = self._colors.take((1 + element) * (stage > 0), 0)
+        return (colors & self._lit.take((1 + x) * (stage > 1), 0))[:, None]
 
     def errors(self, ids: Tensor, goals: Tensor) -> Numbers:
         """Cells of goals, uint8 [B, H, W], whose element is neither there in `ids` nor beside it: int64 [B]."""
@@ -269,6 +267,7 @@ class Episodes:
         self.world: World | None = None
         self._pictures = torch.zeros(batch, side, side, 6, dtype=torch.uint8, device=device)
         """What observations show, without action frames."""
+        self._rows: list[NDArray[np.uint8]] = []  # of observations
         self.goal_ids = torch.zeros(batch, side, side, dtype=torch.uint8, device=device)
         self.goal_pictures = torch.zeros(batch, side, side, 3, dtype=torch.uint8, device=device)
         self._goals: dict[tuple[int, GoalTask], Goal] = {}
@@ -391,14 +390,13 @@ class Episodes:
 
     def _put(self, which: Numbers, part: World) -> None:
         """Take up new states of the worlds `which`: what they show, and their errors."""
-        show = part.sim.observer.rgb
         if len(which) == self.count:
             self.world, goals = part, self.goal_ids
-            show(part.state, self._pictures, size=6)
+            part.sim.observer.rgb(part.state, self._pictures, size=6)
         else:
             places = torch.from_numpy(which).to(self.program.device)
-            shown = show(part.state, torch.zeros_like(self._pictures[: len(which)]), size=6)
-            self._pictures.index_copy_(0, places, shown)
+            shown = torch.empty_like(self._pictures[: len(which)])
+            self._pictures.index_copy_(0, places, part.sim.observer.rgb(part.state, shown, size=6))
             self.world = put_worlds(self._world, places, part, reuse=True)
             goals = self.goal_ids[places]
         if self.mode == "task":
@@ -414,8 +412,16 @@ class Episodes:
         Raises ResetNeeded before the first episode.
         """
         assert self._world
-        frames = self.program.frames(self.stage, *self._chosen[:, :2].T)
-        return (self._pictures.flatten(2) | frames).view_as(self._pictures)
+        frames, shown = self.program.frames(self.stage, *self._chosen[:, :2].T), self._pictures
+        if shown.device.type != "cpu":
+            return (shown.flatten(2) | torch.from_numpy(frames).to(shown.device)).view_as(shown)
+        # Fresh memory from the system costs more than the frames, so rows that nobody else holds are written again.
+        rows = next((rows for rows in self._rows if getrefcount(rows) == 3), None)
+        if rows is None:
+            rows = np.empty((self.count, len(shown[0]), frames.shape[2]), np.uint8)
+            self._rows = [*self._rows[-3:], rows]
+        np.bitwise_or(shown.flatten(2).numpy(), frames, out=rows)
+        return torch.from_numpy(rows).view_as(shown)
 
     def goals(self) -> Tensor:
         """The goals as observations: uint8 [B, H, W, 6]."""

@@ -123,6 +123,27 @@ def test_backends_play_the_same_episodes(easy: LevelProgram, backend: str) -> No
     assert (seen[0][1] == seen[1][1]).all()
 
 
+def test_observations_that_somebody_holds_stay(easy: LevelProgram, torch: Any) -> None:
+    env = PowderworldVectorEnv(easy, 2)
+    env.reset()
+    held, copies, addresses = [], [], set()
+    for number, row in enumerate(actions(12, 2)):
+        observed, *_ = env.step(row)
+        views = (
+            observed,
+            observed[1, 3:],
+            torch.from_numpy(observed)[..., 4],
+            env.episodes.observations()[0],
+        )
+        held.append(views[number % 4])
+        copies.append(held[-1].tolist())
+        del observed, views
+    assert [view.tolist() for view in held] == copies
+    for row in actions(12, 2):
+        addresses.add(env.step(row)[0].ctypes.data)
+    assert len(addresses) <= 2
+
+
 def test_a_goal_depends_on_the_seed_and_the_task_alone(hard: LevelProgram) -> None:
     def goal(env: PowderworldEnv, task: int, seed: int | None = None) -> Any:
         return env.reset(seed=seed, options={"task_id": task})[1]["goal"]
