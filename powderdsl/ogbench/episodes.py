@@ -27,7 +27,7 @@ from powderdsl.simulation.simulator import Simulator, World, compile
 from powderdsl.system.random import MASK, base_keys, mix, name_number
 from powderdsl.targets.cpp.program import PackedState
 from powderdsl.targets.torch.program import TorchProgram
-from powderdsl.tasks.tensors.actions import Blocks, put_worlds, take_worlds
+from powderdsl.tasks.tensors.actions import Blocks, put_rows, put_worlds, take_worlds
 
 Numbers = NDArray[np.int64]
 
@@ -84,10 +84,9 @@ class LevelProgram:
         """The colors of what agents paint: uint8 [n, 3]."""
         line, begins = np.arange(level.side), first.cpu().numpy()[:, None]
         inside = (line >= begins) & (line < begins + level.brush)
+        # Lines of frames, uint8 [n + 1, 6 W], behind one for what is not chosen yet: 255 where an x is lit; colors.
         self._lit = np.repeat(np.vstack([line >= 0, inside]) * np.uint8(255), 6, 1)
-        """A line of a frame for each x, behind one for none yet: 255 where it is lit. uint8 [places + 1, 6 W]."""
         self._colors = np.tile(np.pad(self.paints.cpu().numpy(), ((1, 0), (3, 0))), level.side)
-        """A lit line of a frame for each element, behind one for none yet: uint8 [n + 1, 6 W]."""
 
     def start(self, seeds: Numbers, indices: Numbers) -> World:
         """New worlds. Their draws depend on seed and index, int64 [B] of at least 0 each."""
@@ -361,7 +360,6 @@ class Episodes:
         parts = actions[which]
         invalid = (parts < 0) | (parts >= choices)
         if invalid.any():
-            parts = parts.copy()
             for stage in range(3):
                 bad = np.flatnonzero(invalid & (stages == stage))
                 if len(bad):
@@ -396,7 +394,7 @@ class Episodes:
         else:
             places = torch.from_numpy(which).to(self.program.device)
             shown = torch.empty_like(self._pictures[: len(which)])
-            self._pictures.index_copy_(0, places, part.sim.observer.rgb(part.state, shown, size=6))
+            put_rows(self._pictures, places, part.sim.observer.rgb(part.state, shown, size=6), reuse=True)
             self.world = put_worlds(self._world, places, part, reuse=True)
             goals = self.goal_ids[places]
         if self.mode == "task":

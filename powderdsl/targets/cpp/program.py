@@ -180,10 +180,9 @@ class PackedState(OwnedBatch):
         return taken
 
     def missed(self, goals: Tensor) -> Tensor:
-        """How many cells of goals, uint8 [B, H, W], have their element neither there nor beside it: int64 [B]."""
-        counts, goals = torch.empty(len(goals), dtype=torch.int64), goals.contiguous()
-        where = self.program.homes["element"][:2]
-        self.program.library.pd_missed(self.handle, *where, goals.data_ptr(), counts.data_ptr())
+        """How many cells of contiguous goals, uint8 [B, H, W], have their element neither there nor beside it: int64 [B]."""
+        counts, (slot, bits, _) = torch.empty(len(goals), dtype=torch.int64), self.program.homes["element"]
+        self.program.library.pd_missed(self.handle, slot, bits, goals.data_ptr(), counts.data_ptr())
         return counts
 
     def put(self, places: Tensor, state: Mapping[str, Tensor], *, reuse: bool) -> PackedState:

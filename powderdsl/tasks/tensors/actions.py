@@ -46,7 +46,11 @@ def put_worlds(world: World, places: Tensor, part: World, *, reuse: bool) -> Wor
 
 def put_rows(rows: Tensor, places: Tensor, part: Tensor, reuse: bool) -> Tensor:
     """The rows of a tensor with those of numbers `places` replaced, in place with `reuse`."""
-    return (rows if reuse else rows.clone()).index_copy_(0, places, part)
+    changed = rows if reuse else rows.clone()
+    if rows.device.type != "cpu":
+        return changed.index_copy_(0, places, part)
+    changed.numpy()[places.numpy()] = part.numpy()  # 20 times as fast for bytes
+    return changed
 
 
 def cells_of(agent: Agent, size: Size, rows: Tensor, columns: Tensor) -> Tensor:
