@@ -173,7 +173,7 @@ def equal_mutants(
     for mutant in mutants:
         with suppress(CompileError, NotBits, OutOfWork, Undecided), deep_recursion():
             mutated = original.mutated(mutant)
-            if mutated is None or fingerprint(mutated[0]) == original.fingerprint:
+            if mutated is None or fingerprint(mutated[0]) == fingerprint(original.ruleset):
                 continue
             sides = Side.of(original.ruleset), Side.of(mutated[0])
             is_comparable = why_incomparable(*(side.ruleset for side in sides)) is None
