@@ -102,7 +102,15 @@ LAYERS: dict[str, tuple[str, ...]] = {
     "datasets": (*_SCREEN, *_LEARNING[:7]),
     "rl": (*_SCREEN, *_LEARNING[:8]),
     "worldmodel": (*_SCREEN, *_LEARNING[:8]),
-    "ogbench": (*_SCREEN, "experiments.runs", "tasks", "tasks.tensors", "tasks.episodes", "envs"),
+    "ogbench": (
+        *_SCREEN,
+        "experiments.runs",
+        "tasks",
+        "tasks.tensors",
+        "tasks.episodes",
+        "tasks.compiled",
+        "envs",
+    ),
     # Calls commands, in processes of their own.
     "experiments.studies": (*_FRONT, "compiler", "experiments.runs"),
     "web": (*_BACK, "simulation.standalone", *_WORLDS, "tasks", "tasks.tensors"),

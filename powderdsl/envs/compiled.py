@@ -25,7 +25,7 @@ Steps = tuple[Any, Any, Any, Any, dict[str, Any]]
 
 
 class CompiledEnv(TensorEnv):
-    """A `TensorEnv`, to the bit, that steps by one call where its rules run as native code, and else as `TensorEnv` does.
+    """A `TensorEnv` that steps by one call of native code, with the same results; without native code it steps as before.
 
     Measures that bit planes do not show (`Stepper.measures_cells`) are taken of tensors, between two calls.
     """

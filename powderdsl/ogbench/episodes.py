@@ -8,7 +8,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from itertools import count
-from sys import getrefcount
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -27,6 +26,7 @@ from powderdsl.simulation.simulator import Simulator, World, compile
 from powderdsl.system.random import MASK, base_keys, mix, name_number
 from powderdsl.targets.cpp.program import PackedState
 from powderdsl.targets.torch.program import TorchProgram
+from powderdsl.tasks.compiled import Recycled
 from powderdsl.tasks.tensors.actions import Blocks, put_rows, put_worlds, take_worlds
 
 Numbers = NDArray[np.int64]
@@ -225,6 +225,14 @@ class Goal(NamedTuple):
     picture: Tensor
 
 
+class _Rows(Recycled):
+    """The rows of a batch of observations, uint8."""
+
+    def __init__(self, shape: tuple[int, ...]):
+        self.rows = np.empty(shape, np.uint8)
+        self.watch([self.rows])
+
+
 class Episodes:
     """A batch of episodes of one level. Environment i has the seed `seeds`[i], and its first episode the number 0.
 
@@ -266,7 +274,8 @@ class Episodes:
         self.world: World | None = None
         self._pictures = torch.zeros(batch, side, side, 6, dtype=torch.uint8, device=device)
         """What observations show, without action frames."""
-        self._rows: list[NDArray[np.uint8]] = []  # of observations
+        self._memory: list[_Rows] = []
+        """Of observations."""
         self.goal_ids = torch.zeros(batch, side, side, dtype=torch.uint8, device=device)
         self.goal_pictures = torch.zeros(batch, side, side, 3, dtype=torch.uint8, device=device)
         self._goals: dict[tuple[int, GoalTask], Goal] = {}
@@ -413,13 +422,12 @@ class Episodes:
         frames, shown = self.program.frames(self.stage, *self._chosen[:, :2].T), self._pictures
         if shown.device.type != "cpu":
             return (shown.flatten(2) | torch.from_numpy(frames).to(shown.device)).view_as(shown)
-        # Fresh memory from the system costs more than the frames, so rows that nobody else holds are written again.
-        rows = next((rows for rows in self._rows if getrefcount(rows) == 3), None)
-        if rows is None:
-            rows = np.empty((self.count, len(shown[0]), frames.shape[2]), np.uint8)
-            self._rows = [*self._rows[-3:], rows]
-        np.bitwise_or(shown.flatten(2).numpy(), frames, out=rows)
-        return torch.from_numpy(rows).view_as(shown)
+        memory = next((memory for memory in self._memory if memory.is_free), None)
+        if memory is None:
+            memory = _Rows((self.count, len(shown[0]), frames.shape[2]))
+            self._memory = [*self._memory[-3:], memory]
+        np.bitwise_or(shown.flatten(2).numpy(), frames, out=memory.rows)
+        return torch.from_numpy(memory.rows).view_as(shown)
 
     def goals(self) -> Tensor:
         """The goals as observations: uint8 [B, H, W, 6]."""

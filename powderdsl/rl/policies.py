@@ -63,7 +63,7 @@ class Trunk(nn.Module):
     def forward(self, patches: Tensor) -> Tensor:
         features = self.first(patches).relu_()
         for block, mean in zip(self.blocks, self.means, strict=True):
-            weights = [one.to(features.dtype) for one in (*block.parameters(), *mean.parameters())]
+            weights = [weight.to(features.dtype) for weight in (*block.parameters(), *mean.parameters())]
             features = Residual.apply(features, *weights, block.dilation)
         return features
 

@@ -18,9 +18,10 @@ from torch import Tensor
 
 from powderdsl.model.types import Expr
 from powderdsl.simulation.simulator import World
-from powderdsl.targets.cpp.episodes import ACTION_NUMBERS, MODES, OPS, Fresh, Play
+from powderdsl.targets.cpp.episodes import MODES, OPS, Fresh, Play
 from powderdsl.targets.cpp.program import NativeProgram, PackedState, Places, Views
 from powderdsl.tasks.episodes import Episodes, TaskProgram
+from powderdsl.tasks.goals import ACTION_WORDS
 from powderdsl.tasks.tensors.measures import Masks
 
 POOL_CELLS = 1 << 22
@@ -49,7 +50,7 @@ def _operations(scalar: Expr, measures: Mapping[Any, int], when: str) -> Iterato
         case "measure":
             yield OPS.index(when), measures[scalar.value], 0
         case "action":
-            yield OPS.index("action"), ACTION_NUMBERS.index(scalar.value), 0
+            yield OPS.index("action"), ACTION_WORDS.index(scalar.value), 0
         case "start" | "before":
             yield from _operations(scalar.args[0], measures, scalar.op)
         case _:
@@ -58,10 +59,25 @@ def _operations(scalar: Expr, measures: Mapping[Any, int], when: str) -> Iterato
             yield OPS.index(scalar.op), 0, 0
 
 
-class Results:
-    """What a step gives, a row for each world: see `Results` of episodes.hpp.
+class Recycled:
+    """Arrays that are written again once nobody else holds them: fresh memory from the system costs more than a step."""
 
-    Fresh memory from the system costs more than a step, so results that nobody else holds are written again.
+    def watch(self, arrays: list[Any]) -> None:
+        """Count who holds the arrays now: only this object, and views that it holds."""
+        self._arrays = arrays
+        self._counts = self._references()
+
+    def _references(self) -> list[int]:
+        return [*map(getrefcount, self._arrays)]
+
+    @property
+    def is_free(self) -> bool:
+        """Whether nobody else holds an array, or a view of one."""
+        return self._references() == self._counts
+
+
+class Results(Recycled):
+    """What a step gives, a row for each world: see `Results` of episodes.hpp.
 
     Args:
         worlds: the number of worlds.
@@ -93,22 +109,13 @@ class Results:
             **dict.fromkeys(("_success", "_world"), self.everyone),
         }
         """What is said of all."""
-        self._arrays = [memory, *rows, self.everyone, self.observed]
+        arrays = [memory, *rows, self.everyone, self.observed]
         if self.last_observed is not None:
-            self._arrays.append(self.last_observed)
+            arrays.append(self.last_observed)
         self.addresses = {"results": memory.ctypes.data, "observed": self.observed.ctypes.data}
         self.addresses["last_observed"] = 0 if self.last_observed is None else self.last_observed.ctypes.data
         del memory, rows
-        self._counts: list[int] = []
-        self._counts = self._references()
-
-    def _references(self) -> list[int]:
-        return [*map(getrefcount, self._arrays)]
-
-    @property
-    def is_free(self) -> bool:
-        """Whether nobody holds an array, or a view of one."""
-        return self._references() == self._counts
+        self.watch(arrays)
 
 
 class Plan:
@@ -259,7 +266,7 @@ class Stepper(Plan):
             "now": self._now,
             "masks": masks.words,
             "sizes": masks.sizes,
-            "action": torch.zeros(worlds, len(ACTION_NUMBERS), dtype=torch.int64),
+            "action": torch.zeros(worlds, len(ACTION_WORDS), dtype=torch.int64),
             "begins": self.begins,
             "filled": self.filled,
         }

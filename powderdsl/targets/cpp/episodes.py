@@ -13,9 +13,6 @@ OPS = (
 )  # fmt: skip
 """Operations of formulas, by their numbers."""
 
-ACTION_NUMBERS = ("taken", "left", "painted", "placed", "blown")
-"""Numbers of an action that formulas read, in the order of their rows."""
-
 
 class Formula(ctypes.Structure):
     """An expression as operations on a stack."""

@@ -99,9 +99,9 @@ class Meter:
         With `masks`, packed worlds are not unpacked for measures that bit planes show.
         """
         values = torch.empty(len(world), len(self.measures), dtype=torch.float64, device=self.device)
-        counts = self.counts(world.state.program) if masks and isinstance(world.state, PackedState) else None
-        if counts is not None and masks is not None and isinstance(world.state, PackedState):
-            counts.take(world.state.program.library, world.state.handle, masks.words, masks.sizes, values)
+        state, counts = world.state, None
+        if masks is not None and isinstance(state, PackedState) and (counts := self.counts(state.program)):
+            counts.take(state.program.library, state.handle, masks.words, masks.sizes, values)
         self.take_cells(world, regions, targets, params, values, counts)
         return values
 

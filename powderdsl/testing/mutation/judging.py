@@ -212,10 +212,8 @@ def judge(original: Original, mutant: Mutant, seed: int = 0) -> Verdict:
     if distinction is None:
         return Verdict("survived")
     usual = {param.name: float(param.default) for param in original.ruleset.params}
-    given = distinction.sample.params.items()
-    if distinction.draws or any(
-        usual[name] != value for name, (value,) in given
-    ):  # tests need seeds, set none
+    sets = any(usual[name] != value for name, (value,) in distinction.sample.params.items())
+    if distinction.draws or sets:  # a test needs a seed, and sets no parameter
         return Verdict("survived", differs_in=distinction.slot)
     test = written_test(mutant, distinction, original.sim, original.packs)
     return Verdict("survived", differs_in=distinction.slot, test=test)
