@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import takewhile
@@ -118,7 +118,7 @@ def differs(first: Side, second: Side, budget: Budget) -> Difference | None:
         raise Undecided("draws of other sizes")
     fixed = has_own_parameters(first, second)
     try:
-        groups = _groups(first.program, second.program)
+        groups = _groups(first, second, fixed)
         differences = (_differ(first, second, numbers, budget, fixed) for numbers in groups)
         difference = next((difference for difference in differences if difference), None)
         if (
@@ -136,20 +136,23 @@ def differs(first: Side, second: Side, budget: Budget) -> Difference | None:
 Numbers = tuple[tuple[int, ...], tuple[int, ...]]
 
 
-def _groups(first: Program, second: Program) -> Iterator[Numbers]:
-    """The passes to compare: one by one if there are as many, otherwise all between those that are the same at both ends."""
-    a, b = first.passes, second.passes
-    if [pass_.name for pass_ in a] == [pass_.name for pass_ in b]:
-        yield from (((i,), (i,)) for i in range(len(a)))
-        return
+def _groups(first: Side, second: Side, fixed: bool) -> list[Numbers]:
+    """The passes to compare, without those that are the same and read the same: one by one if all have the same names."""
+    a, b = first.program.passes, second.program.passes
+    words = *second.names.params.items(), *second.names.streams.items()
+    wholes = [replace(side.program, name="", passes=()) for side in (first, second)]
+    alike = not fixed and wholes[0] == wholes[1] and all(name == word for name, word in words)
 
     def same(pair: tuple[PassGraph, PassGraph]) -> bool:
         return structure(pair[0], places=False) == structure(pair[1], places=False)
 
-    start = sum(1 for _ in takewhile(same, zip(a, b, strict=False)))
-    end = sum(1 for _ in takewhile(same, zip(a[start:][::-1], b[start:][::-1], strict=False)))
-    yield tuple(range(start, len(a) - end)), tuple(range(start, len(b) - end))
-    yield from (((len(a) - i,), (len(b) - i,)) for i in range(1, end + 1))
+    groups: list[Numbers] = [((i,), (i,)) for i in range(len(a))]
+    if [pass_.name for pass_ in a] != [pass_.name for pass_ in b]:
+        start = sum(1 for _ in takewhile(same, zip(a, b, strict=False)))
+        end = sum(1 for _ in takewhile(same, zip(a[start:][::-1], b[start:][::-1], strict=False)))
+        middle = tuple(range(start, len(a) - end)), tuple(range(start, len(b) - end))
+        groups = [*groups[:start], middle, *(((len(a) - i,), (len(b) - i,)) for i in range(1, end + 1))]
+    return [(i, j) for i, j in groups if not (alike and i and j and same((a[i[0]], b[j[0]])))]
 
 
 def _differ(

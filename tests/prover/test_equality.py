@@ -64,3 +64,26 @@ passes:
     shared = compare(sims["9"], sims["5"], 10, names=Names())
     assert shared.status == "equal"
     assert shared.given == ("`full` starts with what both can hold",)
+
+
+def test_passes_that_read_alike_are_compared_where_a_parameter_has_another_value() -> None:
+    pack = """
+pack: clock
+params: {most: {type: 0..9, default: 5}}
+elements: {tick: {id: 0, color: "#000000"}}
+fields: {age: {type: 0..9, at: place}, old: {type: flag, at: place}}
+passes:
+  grow:
+    do: age := min(age + 1, most)
+  judge:
+    after: grow
+    do: old := yes where age > 3
+"""
+    rules = load_text(pack)
+    renamed = load_text(pack.replace("judge:", "decide:"))
+    other = load_text(pack.replace("judge:", "decide:").replace("default: 5", "default: 4"))
+    with deep_recursion():
+        assert differs(Side.of(rules), Side.of(renamed), Budget.of(10)) is None
+        difference = differs(Side.of(rules), Side.of(other), Budget.of(10))
+    assert difference is not None
+    assert difference.passes == ((0,), (0,))

@@ -88,6 +88,22 @@ def test_invariants_about_properties_and_tags_are_asked_where_no_world_differs(t
     assert broken.span.text == claim
 
 
+def test_a_mutant_with_another_default_is_another_program(tmp_path):
+    path = tmp_path / "clock.yaml"
+    path.write_text("""\
+pack: clock
+params: {most: {type: 0..9, default: 5}}
+elements: {tick: {id: 0, color: "#000000"}}
+fields: {age: {type: 0..9, at: place}}
+passes:
+  grow:
+    do: age := min(age + 1, most)
+""")
+    original = Original.of(str(path))
+    (larger, smaller) = (m for m in original.mutants() if m.operator == "constant" and "default" in m.diff)
+    assert [judge(original, mutant).status for mutant in (larger, smaller)] == ["survived", "survived"]
+
+
 def test_a_pack_is_in_the_table_once():
     packs = [pack for rules in TABLE.compositions() for pack in TABLE.packs_of(rules)]
     assert len(packs) == len(set(packs))

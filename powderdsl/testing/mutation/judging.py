@@ -141,7 +141,7 @@ def meaning_of(ruleset: Ruleset, memo: Memo) -> tuple[object, object]:
     """What decides how a composition behaves, and what its tests and invariants say of that."""
     program, values = lower(ruleset, memo), [prop.values for prop in ruleset.properties]
     passes = [structure(pass_, places=False) for pass_ in program.passes]
-    parts = program.slots, program.params, program.streams, passes
+    parts = program.slots, program.params, [p.default for p in ruleset.params], program.streams, passes
     return parts, (ruleset.invariants, ruleset.tests, values)
 
 
@@ -150,8 +150,8 @@ def meaning_of(ruleset: Ruleset, memo: Memo) -> tuple[object, object]:
 NOTICED = ("check", "invariant", "test", "generated")
 """The checks that may notice a mutant. `test`: tests written by hand; most run before invariants."""
 
-PROOF = 30.0
-"""Seconds of work, counted, for a proof that a mutant is equal. A tenth comes first, before what takes longer."""
+PROOF = 10.0
+"""Seconds of work, counted, for a proof that a mutant is equal, of the passes that it changes."""
 
 PAIRED = 6
 """Batches of worlds on which invariants are tried that compare several runs."""
@@ -178,7 +178,7 @@ def judge(original: Original, mutant: Mutant, seed: int = 0) -> Verdict:
     for part in original.parts(mutant.pack):
         with suppress(CompileError):  # it may be about another pack
             mutated = part.mutated(mutant)
-            if mutated is None or mutated[1] - part.warnings:
+            if not mutated or mutated[1] - part.warnings or meaning_of(mutated[0], part.memo) == part.meaning:
                 break
             if failed := failed_test(part, part.sim.of(mutated[0]), mutant.pack, quick=True):
                 return failed
@@ -197,25 +197,22 @@ def judge(original: Original, mutant: Mutant, seed: int = 0) -> Verdict:
     sim, focus = original.sim.of(ruleset), focused(original, mutant)
     if failed := failed_test(original, sim, mutant.pack, quick=True):
         return failed
-    comparison = compare(original.sim, sim, PROOF / 10, focus, seed)
-    same = comparison.status == "equal" and meaning[1] == original.meaning[1]
-    if not same and (broken := broken_invariant(original, sim)):
+    comparison = compare(original.sim, sim, PROOF, focus, seed)
+    same = comparison.status == "equal"
+    if not (same and meaning[1] == original.meaning[1]) and (broken := broken_invariant(original, sim)):
         return Verdict("killed", "invariant", broken.text)
-    if comparison.status != "equal":
-        if failed := failed_test(original, sim, mutant.pack, quick=False):
-            return failed
-        if comparison.distinction is None:
-            comparison = compare(original.sim, sim, PROOF, focus, seed)
-    if comparison.status == "equal":
+    if same:
         return Verdict("equivalent", "a proof")
+    if failed := failed_test(original, sim, mutant.pack, quick=False):
+        return failed
     distinction = comparison.distinction
     if distinction is None:
         return Verdict("survived")
     usual = {param.name: float(param.default) for param in original.ruleset.params}
     sets = any(usual[name] != value for name, (value,) in distinction.sample.params.items())
-    if distinction.draws or sets:  # a test needs a seed, and sets no parameter
-        return Verdict("survived", differs_in=distinction.slot)
-    test = written_test(mutant, distinction, original.sim, original.packs)
+    # A test needs a seed, and sets no parameter.
+    shown = not (distinction.draws or sets)
+    test = written_test(mutant, distinction, original.sim, original.packs) if shown else None
     return Verdict("survived", differs_in=distinction.slot, test=test)
 
 
