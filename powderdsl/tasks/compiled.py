@@ -352,15 +352,11 @@ class Stepper(Plan):
         episodes = torch.arange(len(rows)) - (count.cumsum(0) - count - first)[rows]
         places = rows * depth + episodes % depth
         order = places.argsort()
-        fresh = self.program.start(numbers(rows[order], episodes[order]))
-        ahead = (
-            fresh if self._ahead is None else self.program.put(self._ahead, places[order], fresh, reuse=True)
-        )
-        state = ahead.world.state
-        if not isinstance(state, PackedState):
-            state = self.native.pack(state)
-            ahead = replace(ahead, world=ahead.world.with_state(state))
+        ahead = self.program.start(numbers(rows[order], episodes[order]), self.native)
+        if self._ahead is not None:
+            ahead = self.program.put(self._ahead, places[order], ahead, reuse=True)
         self._ahead = ahead
+        state: PackedState = ahead.world.state  # type: ignore[assignment]
         self.filled.copy_(end)
         self.play.pool, self.play.pool_world = state.handle, ahead.seed.data_ptr()
         self.play.pool_start, self.play.pool_sizes = ahead.start.data_ptr(), ahead.masks.sizes.data_ptr()

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from powderdsl.simulation.simulator import Simulator, World
 from powderdsl.simulation.simulator import compile as compile_rules
+from powderdsl.targets.cpp.program import NativeProgram
 from powderdsl.tasks.shipped import check_split, load_task
 from powderdsl.tasks.task import Task
 from powderdsl.tasks.tensors.actions import CLOCK, Hands, put_rows, put_worlds
@@ -87,16 +88,16 @@ class TaskProgram:
 
     # Beginning
 
-    def start(self, seeds: Tensor) -> Episodes:
-        """New episodes of the worlds `seeds`, int64 [B], 0 or more each."""
+    def start(self, seeds: Tensor, native: NativeProgram | None = None) -> Episodes:
+        """New episodes of the worlds `seeds`, int64 [B], 0 or more each; packed for `native` code if it is given."""
         seeds = torch.as_tensor(seeds, dtype=torch.int64, device=self.simulator.device)
         starts = self._starts.make(seeds)
         nothing = torch.zeros_like(seeds)
         clock = (seeds, nothing.clone(), nothing.clone())
-        state = self.hands.fresh_state(starts.ids)
+        state: Any = self.hands.fresh_state(starts.ids, shares=native is not None)
         for name, (values, where) in starts.fields.items():
             state[name] = torch.where(where if values.ndim == 3 else where[:, None], values, state[name])
-        world = World(self.simulator, state, *clock)
+        world = World(self.simulator, native.pack(state) if native else state, *clock)
         masks = self.meter.masks(starts.regions, starts.targets)
         measured = self.meter.take(world, starts.regions, starts.targets, None, masks)
         flags, maps = nothing.bool(), (starts.regions, starts.targets, masks)

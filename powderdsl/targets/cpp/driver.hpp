@@ -333,7 +333,12 @@ static Batch* new_batch(int worlds, const Grid& g) {
       p->zero = true;
       p->around = p->beyond = 0;
     }
-    for (int i = 0; i < REALS; i++) group.real[i] = new_field(b->g), group.real[i]->refs = 1;
+    for (int i = 0; i < REALS; i++) {
+      Field* f = group.real[i] = new_field(b->g);
+      f->refs = 1;
+      f->still = true;
+      memset(f->live, 0, LANES * g.height);
+    }
   }
   return b;
 }

@@ -255,6 +255,8 @@ class NativeProgram(Places):
         """A state in native memory."""
         handle: int = self.library.pd_new(*shape_of(state))
         for name, value in state.items():
+            if not any(value.stride(axis) for axis in (0, -2, -1)) and not value[0, ..., 0, 0].any():
+                continue  # 0 in all cells, as in a new batch
             value = value.contiguous()
             for part, slot, bits, _ in self.parts(name, value):
                 size, stride = value.element_size(), value.stride(0)

@@ -141,14 +141,15 @@ class Hands:
         }
         """What new cells hold, and whether it is the same for all elements: looking ids up takes 20 times as long."""
 
-    def fresh_state(self, ids: Tensor) -> dict[str, Tensor]:
-        """The state of new worlds of known ids, uint8 [B, H, W]: what `Simulator.world` makes, without its checks."""
-        index = ids.int()
-        state = {"element": ids}
+    def fresh_state(self, ids: Tensor, *, shares: bool = False) -> dict[str, Tensor]:
+        """The state of new worlds of ids, uint8 [B, H, W]. `shares`: what all cells hold may be there once, to be read."""
+        index, state = ids.int(), {"element": ids}
         for name, (table, same) in self._fresh.items():
             cells = table[0].expand(*ids.shape, *table.shape[1:]) if same else table[index]
             cells = cells.movedim(-1, 1) if cells.ndim == 4 else cells
-            state[name] = cells.clone(memory_format=torch.contiguous_format) if same else cells.contiguous()
+            if not shares:
+                cells = cells.clone(memory_format=torch.contiguous_format) if same else cells.contiguous()
+            state[name] = cells
         return state
 
     def act(self, world: World, actions: Tensor, *, reuse: bool) -> tuple[World, dict[str, Tensor]]:

@@ -34,13 +34,13 @@ def shape_cells(kind: ArrayKind, shape: str, numbers: Sequence[Array | None], si
 def shape_rows(
     kind: ArrayKind, shape: str, numbers: Sequence[Array | None], size: Size
 ) -> tuple[Array, Array]:
-    """The first row that shapes cover in each column and the one after the last: [..., W], of the type of `_row_type`."""
+    """The first row that shapes cover in each column, and how many: [..., W], of the type of `_row_type`."""
     columns = [None if number is None else number[..., None] for number in numbers]
     edges = covered_rows(kind.xp, shape, columns, kind.arange(size[1]), size)
     first, last = (
         kind.xp.asarray(kind.xp.clip(edge, 0, size[0]), dtype=_row_type(kind, size)) for edge in edges
     )
-    return first, last
+    return first, kind.xp.maximum(first, last) - first
 
 
 def _row_type(kind: ArrayKind, size: Size) -> Any:
@@ -54,10 +54,10 @@ def _row_numbers(kind: ArrayKind, size: Size) -> Array:
     return kind.copied(kind.xp.broadcast_to(row[:, None], size))
 
 
-def cells_between(kind: ArrayKind, first: Array, last: Array, size: Size) -> Array:
+def cells_between(kind: ArrayKind, first: Array, count: Array, size: Size) -> Array:
     """The cells of rows, as `shape_rows` gives them: bool [..., H, W]."""
-    row = _row_numbers(kind, size)
-    return (row >= first[..., None, :]) & (row < last[..., None, :])
+    row = _row_numbers(kind, size) - first[..., None, :]
+    return (row if size[0] < 256 else row & MASK) < count[..., None, :]  # rows above have large numbers
 
 
 CHUNK_CELLS = 1 << 18
@@ -290,8 +290,8 @@ class _Painter:
         self.is_fixed = constants(drawing.amounts) is not None
         if drawing.kind not in _WITHOUT_ROWS and not self.is_fixed:
             rows = shape_rows(kind, drawing.kind, self.numbers, maker.size)
-            first, last = (xp.broadcast_to(edge, (*shape, maker.size[1])) for edge in rows)
-            self.rows = first, last * self.active[..., None]  # no rows without the repetition
+            first, count = (xp.broadcast_to(edge, (*shape, maker.size[1])) for edge in rows)
+            self.rows = first, count * self.active[..., None]  # no rows without the repetition
 
     def painted(
         self, ids: Array, repeat: int, regions: Mapping[str, Array], fields: dict[str, tuple[Array, Array]]
@@ -307,8 +307,8 @@ class _Painter:
         elif self.is_fixed:
             cells = maker.fixed(drawing)
         else:
-            first, last = self.rows
-            cells = cells_between(maker.kind, first[:, repeat], last[:, repeat], maker.size)
+            first, count = self.rows
+            cells = cells_between(maker.kind, first[:, repeat], count[:, repeat], maker.size)
         if drawing.where is not None:
             cells = cells & regions[drawing.where]
         if drawing.over is not None:
