@@ -22,6 +22,7 @@ from powderdsl.syntax.sources import path_beside, read_source, shipped, shipped_
 from powderdsl.system.cache import Memo, collection_paused, persistent
 from powderdsl.system.reading import inside, is_path
 from powderdsl.system.writing import failure
+from powderdsl.universes import is_universe, universe_source
 
 if TYPE_CHECKING:
     from powderdsl.ir.bits import Segment
@@ -246,7 +247,7 @@ def _without(part: str) -> tuple[str, list[str]]:
     """Split a word without ``+`` into the name to load and the packs to leave out."""
     if _is_there(part):
         return part, []
-    path = re.fullmatch(r"(.*\.ya?ml)((?:-[^-/\\]*)*)", part, re.DOTALL)
+    path = re.fullmatch(r"(.*\.ya?ml|universe:-?[^-]*)((?:-[^-/\\]*)*)", part, re.DOTALL)
     head, *rest = (path[1], *path[2].split("-")[1:]) if path else part.split("-")
     return head, rest
 
@@ -260,7 +261,9 @@ def names_in_file(text: str, span: Span, reporter: Reporter) -> list[str] | None
     known, parts = shipped_rules(), text.split("+")
     for part in parts:
         head = part.split("-")[0]
-        if is_path(part):
+        if is_universe(part):
+            names.append(part)
+        elif is_path(part):
             path = path_beside(part, span, reporter)
             names += [str(path)] if path is not None else []
         elif head in known:
@@ -361,8 +364,8 @@ class _Reader:
 
         return {name: needed[name] for name in needed_first(needed)}
 
-    def declaration(self, path: Path | None) -> PackDecl | RulesetDecl | None:
-        source = read_source(path, self.reporter) if path else None
+    def declaration(self, path: Path | Source | None) -> PackDecl | RulesetDecl | None:
+        source = read_source(path, self.reporter) if isinstance(path, Path) else path
         if source is None:
             return None
         self.sources.append(source)
@@ -438,10 +441,12 @@ class _Reader:
         return replace(decl, base=whole)
 
 
-def _find(word: str, reporter: Reporter, ruleset: RulesetDecl | None) -> Path | None:
-    """A file by path or shipped name; packs of a ruleset lie beside its file or are shipped."""
+def _find(word: str, reporter: Reporter, ruleset: RulesetDecl | None) -> Path | Source | None:
+    """A file by path or shipped name, or a universe; packs of a ruleset lie beside its file or are shipped."""
+    span = next((s.span for s in ruleset.packs if s.text == word), None) if ruleset else None
+    if is_universe(word):
+        return universe_source(word, span, reporter)
     if ruleset is not None:
-        span = next((s.span for s in ruleset.packs if s.text == word), None)
         return _find_beside(word, reporter, ruleset, span)
     path = shipped("rules") / f"{word}.yaml"
     if not is_path(word) and _is_there(str(path)):
@@ -474,7 +479,7 @@ def _file_beside(
 ) -> Path | None:
     """The file of a pack in the folder of a declaration, or else the shipped one. Reports a link that leads out (PD112)."""
     folder, name = Path(decl.source.name).parent, f"{word}.yaml"
-    if _is_there(str(folder / name)):
+    if _is_there(str(folder / name)) and not is_universe(decl.source.name):
         try:
             return inside(folder, name)
         except ValueError as error:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 _FRONT = ("arrays", "diagnostics", "system", "syntax", "model")
-_COMPILER = (*_FRONT, "analysis", "ir", "ir.stages", "ir.lower", "schedule", "compiler")
+_COMPILER = (*_FRONT, "universes", "analysis", "ir", "ir.stages", "ir.lower", "schedule", "compiler")
 _TARGETS = ("targets", "targets.torch", "targets.cpp", "targets.wasm", "targets.cuda")
 _BACK = (*_COMPILER, "model.reference", *_TARGETS)
 _STEPS = (
@@ -45,6 +45,7 @@ LAYERS: dict[str, tuple[str, ...]] = {
     "diagnostics": (),
     "system": ("arrays", "diagnostics"),
     "syntax": ("diagnostics", "system"),
+    "universes": ("diagnostics", "system", "syntax"),  # text from a seed, right by construction
     "model": ("diagnostics", "system", "syntax"),
     "model.reference": _FRONT,  # never ir: an oracle that shares the lowering cannot see a bug in it
     "analysis": _FRONT,  # decides from the model alone: no world is run
