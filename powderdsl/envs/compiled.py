@@ -83,7 +83,7 @@ class CompiledEnv(TensorEnv):
 
     def _new_results(self, stepper: Stepper) -> Results:
         """Return results that nobody holds, which the next call writes to."""
-        results = next((results for results in self._results if results.is_free), None)
+        results = next(filter(Results.is_free, self._results), None)
         if results is None:
             space = self.observation.space
             keeps_last = self.autoreset_mode is AutoresetMode.SAME_STEP
@@ -142,7 +142,7 @@ class CompiledEnv(TensorEnv):
             if len(checked) != self.num_envs:
                 raise ValueError(f"{len(checked)} actions for {self.num_envs} environments")
             given = np.asarray(actions)
-        np.copyto(numbers, given.reshape(numbers.shape), casting="unsafe")
+        numbers[...] = given if len(shape) == 2 else given[:, None]
 
 
 def plan_arguments(env: TensorEnv, places: Places) -> tuple[Any, ...]:

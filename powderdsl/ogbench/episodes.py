@@ -422,7 +422,7 @@ class Episodes:
         frames, shown = self.program.frames(self.stage, *self._chosen[:, :2].T), self._pictures
         if shown.device.type != "cpu":
             return (shown.flatten(2) | torch.from_numpy(frames).to(shown.device)).view_as(shown)
-        memory = next((memory for memory in self._memory if memory.is_free), None)
+        memory = next(filter(_Rows.is_free, self._memory), None)
         if memory is None:
             memory = _Rows((self.count, len(shown[0]), frames.shape[2]))
             self._memory = [*self._memory[-3:], memory]

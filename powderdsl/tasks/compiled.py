@@ -27,8 +27,8 @@ from powderdsl.tasks.tensors.measures import Masks
 POOL_CELLS = 1 << 22
 """Cells of the start worlds that are made ahead, about: many small worlds, or few large ones."""
 
-MOST_AHEAD = 64
-"""Start worlds that are made ahead for each episode, at most."""
+MOST_AHEAD, FEW_CELLS = 64, 1 << 16
+"""Start worlds that are made ahead for each episode, at most; more if all have few cells, where a batch is the cost."""
 
 READY, EMPTY = -1, -2
 """Results of `pd_play`: done, or start worlds have to be made before `pd_begin`."""
@@ -70,7 +70,6 @@ class Recycled:
     def _references(self) -> list[int]:
         return [*map(getrefcount, self._arrays)]
 
-    @property
     def is_free(self) -> bool:
         """Whether nobody else holds an array, or a view of one."""
         return self._references() == self._counts
@@ -341,7 +340,7 @@ class Stepper(Plan):
         """
         worlds = len(self.begins)
         cells = worlds * self.program.task.size[0] * self.program.task.size[1]
-        depth = self.play.depth = min(max(2 if cells < POOL_CELLS else 1, POOL_CELLS // cells), MOST_AHEAD)
+        depth = self.play.depth = min(-(-POOL_CELLS // cells), max(MOST_AHEAD, FEW_CELLS // cells))
         assert self.filled is not None
         episode = self._tensors["episode"]
         if not bool((self.begins & (episode + 1 >= self.filled)).any()):
