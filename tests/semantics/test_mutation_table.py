@@ -15,6 +15,7 @@ from powderdsl.simulation.simulator import compile
 from powderdsl.testing.mutation.judging import (
     COUNTED,
     Original,
+    Verdict,
     broken_invariant,
     judge,
     noticed_share,
@@ -37,7 +38,9 @@ def test_every_pack_is_in_the_table_and_the_counts_add_up():
     assert list(measured()) == list(TABLE.compositions())
     for rules, entry in measured().items():
         assert list(entry["packs"]) == TABLE.packs_of(rules)
-        for counts in entry["packs"].values():
+        survivors = entry.get("survivors", {})
+        for pack, counts in entry["packs"].items():
+            assert len(survivors.get(pack, ())) in (counts["survived"], 0)
             assert set(counts) == set(COUNTED)
             assert counts["mutants"] == counts["equivalent"] + counts["killed"] + counts["survived"]
             assert counts["killed"] == sum(counts[key] for key in ("check", "invariant", "test", "generated"))
@@ -48,7 +51,7 @@ def test_every_pack_is_in_the_table_and_the_counts_add_up():
 @pytest.mark.parametrize("rules", TABLE.compositions(), ids=lambda rules: rules.rpartition("/")[2])
 def test_no_more_mutants_survive_than_the_table_says(rules, monkeypatch):
     monkeypatch.chdir(DOCS.parent)
-    for found in TABLE.count(rules, TABLE.packs_of(rules), os.cpu_count() or 1):
+    for found, _ in TABLE.count(rules, TABLE.packs_of(rules), os.cpu_count() or 1):
         for pack, counts in found.items():
             said = measured().get(rules, {"packs": {}})["packs"].get(pack)
             if said is None:
@@ -86,6 +89,36 @@ def test_invariants_about_properties_and_tags_are_asked_where_no_world_differs(t
     mutant = load_text(ROCK.replace(right, wrong))
     broken = broken_invariant(Original.of(str(path)), compile(mutant, backend="wasm"))
     assert broken.span.text == claim
+
+
+def test_survivors_alone_are_judged_again(tmp_path, monkeypatch):
+    path = tmp_path / "clock.yaml"
+    path.write_text("""\
+pack: clock
+elements: {tick: {id: 0, color: "#000000"}}
+fields: {age: {type: 0..9, at: place}}
+passes:
+  grow:
+    do: age := min(age + 1, 5)
+""")
+    killed = {0}
+
+    def campaign(rules, packs, numbers, jobs, seed):
+        for n in numbers:
+            yield n, Verdict("killed", "test") if n in killed else Verdict("survived")
+
+    monkeypatch.setattr("powderdsl.testing.mutation.judging.run_campaign", campaign)
+    ((counts, survivors),) = TABLE.count(str(path), ["clock"], 1)
+    assert counts["clock"]["survived"] == len(survivors["clock"]) == counts["clock"]["mutants"] - 1
+    killed |= {2, 3}
+    ((again, rest),) = TABLE.count(str(path), ["clock"], 1, survivors)
+    assert again["clock"]["mutants"] == counts["clock"]["survived"]
+    ((whole, alive),) = TABLE.count(str(path), ["clock"], 1)
+    assert TABLE.judged_again(counts, again) == whole
+    assert rest == alive
+    path.write_text("# a line before\n" + path.read_text())
+    with pytest.raises(ValueError, match="have changed"):
+        next(TABLE.count(str(path), ["clock"], 1, alive))
 
 
 def test_a_mutant_with_another_default_is_another_program(tmp_path):

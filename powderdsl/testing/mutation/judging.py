@@ -198,16 +198,15 @@ def judge(original: Original, mutant: Mutant, seed: int = 0) -> Verdict:
     if failed := failed_test(original, sim, mutant.pack, quick=True):
         return failed
     comparison = compare(original.sim, sim, PROOF, focus, seed)
-    same = comparison.status == "equal"
-    if not (same and meaning[1] == original.meaning[1]) and (broken := broken_invariant(original, sim)):
+    distinction = comparison.distinction  # without one, what runs many worlds notices nothing either
+    if (distinction or meaning[1] != original.meaning[1]) and (broken := broken_invariant(original, sim)):
         return Verdict("killed", "invariant", broken.text)
-    if same:
+    if comparison.status == "equal":
         return Verdict("equivalent", "a proof")
-    if failed := failed_test(original, sim, mutant.pack, quick=False):
-        return failed
-    distinction = comparison.distinction
     if distinction is None:
         return Verdict("survived")
+    if failed := failed_test(original, sim, mutant.pack, quick=False):
+        return failed
     usual = {param.name: float(param.default) for param in original.ruleset.params}
     sets = any(usual[name] != value for name, (value,) in distinction.sample.params.items())
     # A test needs a seed, and sets no parameter.
