@@ -81,6 +81,8 @@ class Universe:
     pieces: Pieces
     names: dict[str, str] = field(default_factory=dict)
     """The names of elements, by part."""
+    tags: dict[str, str] = field(default_factory=dict)
+    """The tags of elements that no other has, by part."""
     levels: dict[str, int] = field(default_factory=dict)
     """How high parts stand; reactions turn what is higher into what is not."""
     params: list[str] = field(default_factory=list)
@@ -99,6 +101,7 @@ class Universe:
             name += f"_{sum(other.startswith(name) for other in self.passes) + 1}"
         words = Words(self, name, law.get("chances", {}))
         stand_for = {part: part for part in self.names} | chosen
+        words.known |= {f"tag {part}": (tag, tag) for part, tag in self.tags.items()}
         words.known |= {letter: (self.names.get(part, part),) * 2 for letter, part in stand_for.items()}
         said = words.filled(law["about"])
         self.sentences.append(said[:1].upper() + said[1:])
@@ -108,7 +111,8 @@ class Universe:
             self.passes[name] = self.block("pass", name=name, about=self.sentences[-1], body=body)
 
     def candidates(self, choice: str | Sequence[str], chosen: Mapping[str, str]) -> Iterable[str]:
-        """The parts that a letter may stand for: those of a list or a group, or below or above another letter's part."""
+        """The parts that a letter may stand for: those of a list or a group, or some that are no higher than another letter's,
+        with or without nothing, as high, or no lower."""
         groups, levels = self.pieces["groups"], {self.pieces["nothing"]: 0, **self.levels}
         if not isinstance(choice, str):
             return choice
@@ -116,9 +120,13 @@ class Universe:
             return list(groups[choice])
         way, letter = choice.split()
         level = levels[chosen[letter]]
-        if way == "below":
-            return [part for part in groups["product"] if levels[part] <= level]
-        return [part for part in groups["active"] if levels[part] >= level]
+        fitting = {
+            "below": (part for part in groups["product"] if levels[part] <= level),
+            "under": (part for part in groups["product"] if levels[part] <= level and part in self.names),
+            "level": (part for part in groups["wild"] if levels[part] == level),
+            "above": (part for part in groups["active"] if levels[part] >= level),
+        }
+        return fitting[way]
 
     def block(self, piece: str, **values: str | list[str]) -> list[str]:
         """The lines of a piece. Lists take the place of the lines that name them alone."""
@@ -140,7 +148,7 @@ class Words:
     universe: Universe
     name: str
     own: Mapping[str, str]
-    """The chances that are named after themselves, not after the law."""
+    """The chances that are named after themselves, and the number of the law; others are named after the law."""
     known: dict[str, Phrase] = field(default_factory=dict)
 
     def filled(self, text: str, form: int = 1) -> str:
@@ -155,8 +163,10 @@ class Words:
 
     def drawn(self, word: str, letter: str | None) -> Phrase:
         draws, choices = self.universe.draws, self.universe.pieces["words"].get(word)
+        if isinstance(choices, str):
+            return (str(draws.within(choices)),) * 2
         if choices is None:
-            name = word if word in self.own else self.name
+            name = word + self.name.lstrip("abcdefghijklmnopqrstuvwxyz") if word in self.own else self.name
             chance = f"{draws.within(self.own.get(word) or self.universe.pieces['chances'][word])}%"
             self.universe.params.append(f"{name}: {chance}")
             return name, chance
@@ -170,7 +180,8 @@ class Words:
 def _elements(universe: Universe) -> list[str]:
     """The lines of the elements, in the order of their tags. Their names, levels and kinds are drawn."""
     draws, laws = universe.draws, universe.pieces
-    parts, tags = laws["parts"], {part: row["tag"] for part, row in laws["parts"].items()}
+    parts, tags = laws["parts"], universe.tags
+    tags |= {part: row["tag"] for part, row in parts.items()}
     for same in laws["dealt"]:
         tags |= zip(same, draws.shuffled(tags[part] for part in same), strict=True)
     starts, *others = laws["names"]
@@ -225,7 +236,7 @@ def invented(seed: int) -> str:
         "pack",
         seed=str(seed),
         laws=" ".join(universe.sentences),
-        params=universe.params,
+        params=sorted(universe.params),
         tags=[f'{tag}: "{about}"' for tag, about in tags.items()],
         elements=elements,
         passes=[line for pass_ in universe.passes.values() for line in pass_],
