@@ -32,15 +32,18 @@ def assert_same(first: Any, second: Any, place: str) -> None:
         assert first.numpy().tobytes() == second.numpy().tobytes(), place
 
 
-def both(task: Any, worlds: int, split: str = "train", **how: Any) -> tuple[Any, Any]:
-    """Return a `TensorEnv` and a `CompiledEnv` of a task."""
+def both(task: Any, worlds: int, split: str = "train", plain: str = "native", **how: Any) -> tuple[Any, Any]:
+    """Return a `TensorEnv` and a `CompiledEnv` of a task, or two of the latter if `plain` is another backend."""
     skip_without_compiler()
     from powderdsl.envs.compiled import CompiledEnv
     from powderdsl.envs.tensor_env import TensorEnv
     from powderdsl.tasks.episodes import compile_task
 
     program = compile_task(task, backend="native", split=split)
-    return TensorEnv(program, worlds, **how), CompiledEnv(program, worlds, **how)
+    compiled = CompiledEnv(program, worlds, **how)
+    if plain == "native":
+        return TensorEnv(program, worlds, **how), compiled
+    return CompiledEnv(compile_task(task, backend=plain, split=split), worlds, **how), compiled
 
 
 def random_actions(env: Any, draws: random.Random) -> Any:
@@ -66,7 +69,7 @@ def assert_alike(plain: Any, compiled: Any, steps: int, seed: int) -> None:
     assert_same(plain.state(), compiled.state(), "state")
 
 
-def assert_task_alike(name: str, seed: int, steps: int) -> None:
+def assert_task_alike(name: str, seed: int, steps: int, plain: str = "native") -> None:
     """Assert it of a shipped task, with options that the seed draws."""
     draws, task = random.Random(seed), load_task(name)
     how = {
@@ -78,7 +81,7 @@ def assert_task_alike(name: str, seed: int, steps: int) -> None:
         "action_mask": draws.choice([False, True]),
     }
     split = draws.choice([split.name for split in task.splits])
-    assert_alike(*both(task, draws.choice([1, 2, 5, 9, 17]), split, **how), steps, seed)
+    assert_alike(*both(task, draws.choice([1, 2, 5, 9, 17]), split, plain, **how), steps, seed)
 
 
 @pytest.mark.parametrize(
@@ -95,6 +98,7 @@ def test_shipped_tasks_are_the_same(name, seed):
 def test_all_shipped_tasks_are_the_same(name):
     for seed in range(8):
         assert_task_alike(name, seed, 300)
+        assert_task_alike(name, seed, 30, "wasm")
 
 
 TASK = """task: measured
