@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 FORMAT = "powderdsl-dataset"
 VERSION = 1
 FILE = "dataset.json"
-KINDS = ("ids", "compact")
+KINDS = ("ids", "compact", "laws")
 """Observations that are recorded. The others follow from these."""
 USUAL_SHARD = 256
 USUAL_SHARD_BYTES = 1 << 28

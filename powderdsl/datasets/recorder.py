@@ -27,7 +27,7 @@ from powderdsl.datasets.manifest import (
 )
 from powderdsl.diagnostics import CompileError
 from powderdsl.envs.actions import FrameStack, Policy, random_policy
-from powderdsl.envs.compiled import CompiledEnv
+from powderdsl.envs.mixed import environment
 from powderdsl.envs.tensor_env import Observation, observation_of
 from powderdsl.experiments.runs import differences, lock_folder
 from powderdsl.system.random import action_keys
@@ -88,7 +88,7 @@ def record(
         folder: the folder to write, which is made, but not its parent.
         episodes: the number of episodes.
         seed: the world of the first episode; keys of actions depend on it too.
-        observation: ``ids`` or ``compact``.
+        observation: ``ids``, ``compact`` or ``laws``.
         shard: episodes in a shard; by default 256, or fewer if these take more than 256 MiB.
         compress: a seventh of the disk space for ``ids``, a quarter for ``compact``, and slower to read.
         envs: the largest number of episodes that are played at once; it does not change the recording.
@@ -108,9 +108,9 @@ def record(
     name = policy if isinstance(policy, str) else policy_name
     if not name:
         raise ValueError("a policy that is a function needs a policy_name, by which its data are known")
-    env = CompiledEnv(task, 1, observation=observation, autoreset_mode="disabled", **how)
+    env = environment(task, 1, observation=observation, autoreset_mode="disabled", **how)
     recipe = recipe_of(env, policy=name, episodes=episodes, seed=seed, compress=compress, shard=shard)
-    sight = observation_of(sees or observation, env.simulator, env.task.size)
+    sight = observation_of(sees or observation, env.program)
     act = SCRIPTED[policy](env.program) if isinstance(policy, str) else policy
     place = Path(folder)
     with lock_place(place):
@@ -202,7 +202,7 @@ class _Recording:
     def played(self, numbers: Array, done: int, progress: Progress) -> list[dict[str, Array]]:
         """The arrays of some episodes, played at once. Those that are over run on, and no longer count."""
         recipe, count = self.recipe, len(numbers)
-        env = CompiledEnv(
+        env = environment(
             self.program,
             count,
             observation=recipe.observation,
@@ -227,7 +227,7 @@ class _Recording:
                 actions = self.policy(env.episodes)
             else:
                 own = self.sight.kind == recipe.observation
-                shown = stack.push(observed if own else self.sight.of(env.episodes.world))
+                shown = stack.push(observed if own else self.sight.of(env.episodes))
                 with torch.no_grad():
                     actions = torch.as_tensor(self.policy(shown, action_keys(recipe.seed, episodes, step)))
             observed, reward, terminated, truncated, info = env.step(actions)

@@ -133,6 +133,7 @@ _ROWS = (
     ("PD804", "invalid-agent"),
     ("PD805", "constant-reward", _WARNING),
     ("PD806", "invalid-study"),
+    ("PD807", "laws-not-held-out", _WARNING),
     # PD9xx: our own mistakes
     ("PD901", "internal-error"),
 )

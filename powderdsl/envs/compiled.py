@@ -31,6 +31,7 @@ class CompiledEnv(TensorEnv):
     """
 
     _stepper: Stepper | None = None
+    _results: Sequence[Results] = ()
     _bound: tuple[Any, Any] = (None, None)
     """The episodes and parameters that the stepper steps."""
 
@@ -44,11 +45,12 @@ class CompiledEnv(TensorEnv):
             return None
         if self._stepper is None or self._stepper.native is not native:
             self._stepper = Stepper(self.program, native, *plan_arguments(self, native))
-            self._results: list[Results] = []
-        params = self.simulator.parameters(self.params, self.num_envs)
+            self._results = ()
         kept = {"episode": self._episode, "returned": self._returned, "waiting": self._ended}
-        self.episodes = self._stepper.bind(self.episodes, params, kept)
+        self.episodes = self._stepper.bind(self.episodes, self.params, kept)
         self._waiting = self._ended.numpy()
+        if self.observation.kind == "laws":
+            self._told = self.program.told(self.episodes).numpy()
         self._bound = self.episodes, self.params
         return self._stepper
 
@@ -69,12 +71,25 @@ class CompiledEnv(TensorEnv):
         stepper.begins.copy_(mask)
         stepper.fill(self._numbers)
         self._ended &= ~mask
-        observed = self._new_results(stepper).observed
+        results = self._new_results(stepper)
         stepper.begin()
+        self._tell(results, None)
         info: Info = {"success": nobody, "_success": nobody.clone()}
         self._add_ended(info, nobody)
         self._add_shown(info, mask)
-        return torch.from_numpy(observed), info
+        return torch.from_numpy(results.observed), info
+
+    def _tell(self, results: Results, ended: Any) -> None:
+        """Write laws behind the elements, if observations have them; `ended`: whose last observations there are."""
+        if self.observation.kind != "laws":
+            return
+        assert self.episodes is not None
+        before, self._told = self._told, self.program.told(self.episodes).numpy()
+        count, cells = self._told.shape[1], results.observed[0, 1].size
+        results.observed.reshape(-1, 2, cells)[:, 1, :count] = self._told
+        if results.last_observed is not None and ended is not None:
+            lasts = results.last_observed.reshape(-1, 2, cells)
+            lasts[: np.count_nonzero(ended), 1, :count] = before[ended]
 
     def _numbers(self, rows: Tensor, episodes: Tensor) -> Tensor:
         """Return the numbers of the worlds that rows play in episodes: int64 [n]."""
@@ -83,12 +98,16 @@ class CompiledEnv(TensorEnv):
 
     def _new_results(self, stepper: Stepper) -> Results:
         """Return results that nobody holds, which the next call writes to."""
-        results = next(filter(Results.is_free, self._results), None)
+        fitting = (results for results in self._results if len(results.everyone) == self.num_envs)
+        results = next(filter(Results.is_free, fitting), None)
         if results is None:
             space = self.observation.space
             keeps_last = self.autoreset_mode is AutoresetMode.SAME_STEP
-            results = Results(self.num_envs, space.shape, space.dtype, keeps_last)
-            self._results = [results, *self._results[:2]]
+            make = np.zeros if self.observation.kind == "laws" else np.empty
+            shown = [make((self.num_envs, *space.shape), space.dtype) for _ in range(1 + keeps_last)]
+            results = Results(np.empty(Results.SIZE * self.num_envs, np.uint8), *shown)
+            del shown
+            self._results = (results, *self._results[:2])
         stepper.write_to(results)
         return results
 
@@ -122,6 +141,7 @@ class CompiledEnv(TensorEnv):
             stepper.fill(self._numbers)
             stepper.begin()
         info, ended = dict(results.info), results.ended
+        self._tell(results, ended)
         if mode is AutoresetMode.NEXT_STEP:
             info["_success"] = active
         if results.last_observed is not None:
@@ -149,8 +169,9 @@ def plan_arguments(env: TensorEnv, places: Places) -> tuple[Any, ...]:
     """Return the arguments of `Plan` after its first two, for what an environment's step does."""
     form, space, size = env.action_form, env.observation.space, env.task.size
     assert space.dtype is not None
+    kind = "ids" if env.observation.kind == "laws" else env.observation.kind
     return (
-        env.simulator.observer.views(env.observation.kind, places, size[0] * size[1]),
+        env.simulator.observer.views(kind, places, size[0] * size[1]),
         int(np.prod(space.shape)) * space.dtype.itemsize,
         env.autoreset_mode.name,
         env.max_episode_steps,

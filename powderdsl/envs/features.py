@@ -14,6 +14,9 @@ from powderdsl.envs.tensor_env import TensorEnv
 FEWEST, MOST = 8, 32
 """Patches along a side: as many as the agent has bins, within these bounds."""
 
+LAW_FEATURES = 16
+"""Numbers that a network makes of laws."""
+
 
 class Expand(nn.Module):
     """The channels of ``matrix``, float32 [B, C, H, W], from observations ``ids`` or ``compact``.
@@ -102,6 +105,26 @@ class Patches(MatrixPatches):
         return torch.cat(parts, 1) if len(parts) > 1 else parts[0]
 
 
+class LawPatches(nn.Module):
+    """From `laws` observations to patches of the elements, and features of the laws, which are the same in every patch.
+
+    Args:
+        see: makes patches of element ids.
+        laws: bytes of laws.
+    """
+
+    def __init__(self, see: Patches, laws: int):
+        super().__init__()
+        self.see, self.laws, self.read = see, laws, nn.Linear(laws, LAW_FEATURES)
+        self.channels = see.channels + LAW_FEATURES
+
+    def forward(self, observed: Tensor) -> Tensor:
+        patches = self.see(observed[:, :1])
+        told = observed[:, 1].flatten(1)[:, : self.laws].float() / 127.5 - 1
+        features = self.read(told).relu()[..., None, None].expand(-1, -1, *patches.shape[2:])
+        return torch.cat([patches, features], 1)
+
+
 class Frames(nn.Module):
     """The features that `see` extracts from each of several stacked observations, oldest first: [B, frames · channels, …]."""
 
@@ -149,12 +172,15 @@ def patches_of(env: TensorEnv, patches: tuple[int, int], frames: int = 1) -> Any
     Raises ValueError for observations that are pictures.
     """
     _refuse_pictures(env)
+    see: Any
     count, size = len(env.observation.channels), env.task.size
     if env.observation.kind == "matrix":
         see = MatrixPatches(count, size, patches)
     else:
-        values = env.simulator.observer.compact_values[:count]
+        values = env.simulator.observer.compact_values[: 1 if env.observation.kind == "laws" else count]
         see = Patches(env.simulator.ruleset.slots, size, patches, values)
+        if env.observation.kind == "laws":
+            see = LawPatches(see, len(env.program.laws))
     return see if frames == 1 else Frames(see, frames)
 
 

@@ -23,6 +23,7 @@ from torch import Tensor
 
 from powderdsl.envs import env_id
 from powderdsl.envs.compiled import CompiledEnv, arrays_of
+from powderdsl.envs.mixed import environment
 from powderdsl.envs.tensor_env import TensorEnv
 from powderdsl.simulation.draw import scale
 from powderdsl.system.settings import check_choice
@@ -63,7 +64,7 @@ class Face:
         self.render_mode, self.render_scale = rest.pop("render_mode"), rest.pop("render_scale")
         if self.render_mode is not None:
             check_choice("render_mode", self.render_mode, RENDER_MODES)
-        self.tensors = CompiledEnv(task, **rest)
+        self.tensors = environment(task, **rest)
         self.spec = EnvSpec(
             env_id(self.tensors.task.name),
             entry_point="powderdsl.envs.gym:PowderEnv",

@@ -40,7 +40,13 @@ def c_environment(env: TensorEnv, worlds: int, name: str) -> CEnvironment:
 
     `name`: the file name of the header. Raises CompileError: PD702 if bit planes do not show all that a step needs.
     """
-    ruleset, size = env.task.ruleset, env.task.size
+    ruleset, size, split = env.task.ruleset, env.task.size, env.task.split(env.split)
+    if split.params or split.rulesets:
+        raise failure(
+            "PD702",
+            f"the worlds of the split {split.name} have laws of their own",
+            helps=("choose another --split",),
+        )
     segments = segments_of(ruleset)
     if len(segments) > 1 or segments[0].planes is None:
         raise failure(

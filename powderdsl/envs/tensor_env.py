@@ -17,15 +17,16 @@ from torch import Tensor
 from powderdsl.envs.actions import action_form
 from powderdsl.model.state import property_values
 from powderdsl.simulation.observe import Observer
-from powderdsl.simulation.simulator import MAX_CELLS, Simulator, World
+from powderdsl.simulation.simulator import MAX_CELLS
 from powderdsl.simulation.state_checks import check_mapping
 from powderdsl.system.random import MASK, mix
 from powderdsl.system.settings import check_choice, check_count
-from powderdsl.tasks.episodes import Episodes, TaskProgram, compile_task, load_task
+from powderdsl.tasks.episodes import Episodes, TaskProgram, load_program
+from powderdsl.tasks.laws import Laws
+from powderdsl.tasks.mixed import MixedEpisodes
 from powderdsl.tasks.task import Task
-from powderdsl.worlds.raster import Size
 
-OBSERVATIONS = ("ids", "compact", "matrix", "rgb")
+OBSERVATIONS = ("ids", "compact", "matrix", "rgb", "laws")
 
 
 @dataclass(frozen=True)
@@ -34,46 +35,61 @@ class Observation:
 
     ``ids``: uint8 [1, H, W], element ids. ``compact``: uint8 [C, H, W], everything that lasts from step to step, as
     `Observer.compact` codes it. ``matrix``: float32 [C, H, W], as the ruleset's `matrix:` names its channels (the
-    paper's 20). ``rgb``: uint8 [H, W, 3].
+    paper's 20). ``rgb``: uint8 [H, W, 3]. ``laws``: uint8 [2, H, W], element ids, and then the `Laws` of the world: row by
+    row, and zeros behind them.
     """
 
     kind: str
     space: Box
     """Of one world."""
+    laws: Laws
     channels: tuple[str, ...]
     """The names of the channels."""
 
-    def of(self, world: World) -> Tensor:
+    def of(self, episodes: Episodes | MixedEpisodes) -> Tensor:
         """The observations of a batch, in memory of their own: [B, *space.shape]."""
+        world: Any = episodes.world
         shape, dtype = (len(world), *self.space.shape), getattr(torch, self.space.dtype.name)
         out = torch.empty(shape, dtype=dtype, device=world.seed.device)
-        if self.kind == "ids":
+        if self.kind in ("ids", "laws"):
             world.read("element", out[:, 0])
         else:
             getattr(world, self.kind)(out)
+        if self.kind == "laws":
+            told = (
+                episodes.joined(TaskProgram.told)
+                if isinstance(episodes, MixedEpisodes)
+                else self.laws.of(episodes.params, len(episodes))
+            )
+            out[:, 1] = 0
+            out[:, 1].flatten(1)[:, : told.shape[1]] = told
         return out
 
 
 def channels_of(kind: str, observer: Observer) -> tuple[str, ...]:
     """The names of the channels of a kind of observation. Raises ValueError for an unknown kind."""
     check_choice("observation", kind, OBSERVATIONS)
-    if kind in ("ids", "rgb"):
-        return ("element",) if kind == "ids" else ("red", "green", "blue")
+    few = {"ids": ("element",), "rgb": ("red", "green", "blue"), "laws": ("element", "laws")}
+    if kind in few:
+        return few[kind]
     return observer.compact_names if kind == "compact" else observer.matrix_names
 
 
-def observation_of(kind: str, simulator: Simulator, size: Size) -> Observation:
-    """The observation of a kind. Raises ValueError for an unknown kind."""
-    observer, ruleset = simulator.observer, simulator.ruleset
-    channels = channels_of(kind, observer)
+def observation_of(kind: str, program: TaskProgram) -> Observation:
+    """The observation of a kind. Raises ValueError for an unknown kind, and for laws that are none, or too many."""
+    observer, ruleset, laws = program.simulator.observer, program.simulator.ruleset, program.laws
+    channels, size = channels_of(kind, observer), program.task.size
     shape = (*size, 3) if kind == "rgb" else (len(channels), *size)
+    if kind == "laws" and not 0 < len(laws) <= size[0] * size[1]:
+        much = "are the same in all worlds" if not len(laws) else f"take {len(laws)} bytes, more than cells"
+        raise ValueError(f"observation `laws`: the laws of {program.task.name} {much}")
     if kind != "matrix":
         # Bytes, 0..255 whatever occurs: what Stable-Baselines3 takes for pictures, and stores as such.
-        return Observation(kind, Box(0, 255, shape, np.uint8), channels)
+        return Observation(kind, Box(0, 255, shape, np.uint8), laws, channels)
     bounds = [abs(bound) for slot in observer.slots.values() for bound in (slot.kind.lo, slot.kind.hi)]
     bounds += [max(map(abs, property_values(ruleset, prop.name))) for prop in ruleset.properties]
     limit = max(ruleset.slots, *bounds)
-    return Observation(kind, Box(-limit, limit, shape, np.float32), channels)
+    return Observation(kind, Box(-limit, limit, shape, np.float32), laws, channels)
 
 
 Info = dict[str, Any]
@@ -109,7 +125,8 @@ class TensorEnv:
             share and which already has its split, knobs, parameters, backend and device.
         num_envs: the number of environments, B.
         split: the set of worlds: ``train``, ``test``, or another split of the task.
-        observation: the form of observations: ``ids``, ``compact``, ``matrix`` or ``rgb`` (docs/environments.md).
+        observation: the form of observations: ``ids``, ``compact``, ``matrix``, ``rgb`` or ``laws``
+                (docs/environments.md).
         knobs: values for the task's knobs, by name.
         params: values for parameters of the task's rules, by qualified name; `reset` may override them.
         worlds: later episodes draw from the worlds 0 … worlds − 1 of the split.
@@ -130,11 +147,14 @@ class TensorEnv:
         single_action_space: the Gymnasium space of the actions of one environment.
         action_nvec: the number of values of each number of an action.
         device: the torch device of all tensors.
+        takes_mixed: whether worlds may run under different rulesets.
 
     Raises:
         CompileError: an unknown task, split, knob or parameter.
         ValueError: another argument is wrong.
     """
+
+    takes_mixed = False
 
     def __init__(
         self,
@@ -158,19 +178,18 @@ class TensorEnv:
         check_count("worlds", worlds, MAX_SEED)
         check_count("max_episode_steps", 1 if max_episode_steps is None else max_episode_steps, MAX_SEED)
         check_choice("last_action", last_action, LAST_ACTIONS)
-        if isinstance(task, Task) and (knobs or params):
-            raise ValueError("knobs and params are given to `load_task` where the task is loaded before")
-        if isinstance(task, str | Path):
-            task = load_task(task, knobs=knobs, params=params)
-        check_cells(num_envs, task.size if isinstance(task, Task) else task.task.size)
-        if isinstance(task, Task):
-            task = compile_task(task, split=split, backend=backend, device=device, threads=threads)
-        self.program, self.task, self.split = task, task.task, task.split
+        machine = {"backend": backend, "device": device, "threads": threads}
+        self.program = load_program(task, split=split, knobs=knobs, params=params, **machine)
+        self.task, self.split = self.program.task, self.program.split
+        check_cells(num_envs, self.task.size)
+        if self.program.is_mixed and not self.takes_mixed:
+            message = f"the worlds of {self.task.name}, {self.split}, run under different rulesets"
+            raise ValueError(f"{message}: use powderdsl.envs.environment")
         self.num_envs, self.worlds = num_envs, worlds
         self.simulator = self.program.simulator
         self.device = self.simulator.device
         self.autoreset_mode = mode_of(autoreset_mode)
-        self.observation = observation_of(observation, self.simulator, self.task.size)
+        self.observation = observation_of(observation, self.program)
         self.action_form = action_form(actions, self.task.agent, self.device)
         self.single_action_space, self.action_nvec = self.action_form.space, self.action_form.nvec
         self.shows_mask = action_mask
@@ -220,18 +239,34 @@ class TensorEnv:
         worlds = world_seeds(base, episode, self.worlds)
         if "worlds" in settings:
             worlds = self.simulator.numbers(settings["worlds"], "worlds", self.num_envs)
-        if self.episodes is None:
-            self.episodes = self.program.start(worlds)
-        else:
-            self.episodes = self.program.restart(self.episodes, mask, worlds, reuse=True)
         self._base, self._episode, self.params = base, episode, params
+        self._restart(mask, worlds)
         self._returned = self._returned.masked_fill(mask, 0)
         self._ended = self._ended & ~mask
         nobody = torch.zeros_like(mask)
         info: Info = {"success": nobody, "_success": nobody.clone()}
         self._add_ended(info, nobody)
         self._add_shown(info, mask)
-        return self.observation.of(self.episodes.world), info
+        assert self.episodes is not None
+        return self.observation.of(self.episodes), info
+
+    def _restart(self, mask: Tensor, worlds: Tensor) -> None:
+        """Begin episodes where `mask`, bool [B], is set, in the worlds of those numbers, int64 [B]."""
+        if self.episodes is None:
+            self.episodes = self.program.start(worlds)
+        else:
+            self.episodes = self.program.restart(self.episodes, mask, worlds, reuse=True)
+
+    def adopt(self, episodes: Episodes, returned: Tensor, params: Mapping[str, Tensor]) -> None:
+        """Go on with other episodes, as many as they are, none of which is over.
+
+        Args:
+            returned: their returns so far, float64 [B].
+            params: parameters as `params` has them, [B] each.
+        """
+        self.num_envs, self.episodes, self.params = len(episodes), episodes, dict(params)
+        self._returned, self._ended = returned, torch.zeros_like(episodes.failed)
+        self._base, self._episode = torch.zeros_like(episodes.seed), torch.zeros_like(episodes.seed)
 
     def _add_ended(self, info: Info, ended: Tensor) -> None:
         """Add return and length of the episodes where `ended`, bool [B], is set; zeros elsewhere."""
@@ -272,7 +307,14 @@ class TensorEnv:
             return self.params
         whole = self.simulator.parameters(check_mapping("params", changes), self.num_envs)
         names = changes.keys() if bool(mask.all()) else {**changes, **self.params}.keys()
-        old = {**self.simulator.parameters({}, self.num_envs), **self.params}
+        drawn = {part.name for part in self.task.split(self.split).params}
+        for name in drawn - {*changes}:
+            whole[name] = torch.full_like(whole[name], torch.nan)  # each world keeps what it draws
+        old = {
+            **self.simulator.parameters({}, self.num_envs),
+            **dict.fromkeys(drawn, torch.tensor(torch.nan)),
+        }
+        old |= self.params
         return {name: torch.where(mask, whole[name], old[name]) for name in names}
 
     # Saving
@@ -309,7 +351,7 @@ class TensorEnv:
         self.episodes, self.params = episodes, params
         for name, value in rows.items():
             setattr(self, f"_{name}", value)
-        return self.observation.of(episodes.world)
+        return self.observation.of(episodes)
 
     # Stepping
 
@@ -355,7 +397,7 @@ class TensorEnv:
         ended = terminated | truncated
         info: Info = {"success": success, "_success": ~waiting}
         self._add_ended(info, ended)
-        observed = self.observation.of(after.world)
+        observed = self.observation.of(after)
         if self.autoreset_mode is AutoresetMode.SAME_STEP:
             self._begin(ended, observed, info)
         else:
@@ -386,7 +428,7 @@ class TensorEnv:
         self._returned = self._returned.masked_fill(mask, 0)
         fresh = self.program.start(world_seeds(self._base, self._episode, self.worlds)[places])
         self.episodes = self.program.put(self.episodes, places, fresh, reuse=True)
-        observed[places] = self.observation.of(fresh.world)
+        observed[places] = self.observation.of(fresh)
 
 
 def seeds_of(seed: Any, count: int) -> list[int | None]:

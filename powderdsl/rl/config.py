@@ -15,7 +15,7 @@ from powderdsl.tasks.shipped import check_split
 if TYPE_CHECKING:
     from powderdsl.tasks.task import Task
 
-OBSERVATIONS = ("compact", "ids", "matrix")
+OBSERVATIONS = ("compact", "ids", "matrix", "laws")
 USUAL_OBSERVATION = MappingProxyType({"paper": "compact", "small": "ids", "fcn": "ids"})
 """The networks, and the observation that each takes unless another is given."""
 
@@ -217,11 +217,13 @@ def chosen_policies(policies: Sequence[str] | None, task: Task, *, trained: bool
 def _contradictions(config: TrainConfig) -> Iterator[str]:
     if config.init_from and config.init_expert:
         yield "`init_from` and `init_expert` are both given: the network learns from one of them"
+    if config.observation == "laws" and config.network != "small":
+        yield "`observation`: only the network `small` reads laws"
     if config.init_from or config.init_expert:
         if config.frames != 1:
             yield "`frames`: recorded actions belong to single observations, so cloning takes 1"
         if config.observation == "matrix":
-            yield "`observation`: episodes are recorded as `ids` or `compact`, not as `matrix`"
+            yield "`observation`: episodes are recorded as `ids`, `compact` or `laws`, not as `matrix`"
     if config.rollout * config.envs < 2:
         yield "`rollout` × `envs` is 1: an update needs two actions or more"
 

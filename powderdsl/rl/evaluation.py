@@ -116,7 +116,9 @@ def play(
             with `seed`; 0, 1, … otherwise.
         recorder: is shown all worlds and actions.
     """
-    sight = observation_of(observation, program.simulator, program.task.size)
+    if program.is_mixed:
+        return _play_mixed(program, policy, worlds, observation, numbers, seed)
+    sight = observation_of(observation, program)
     episodes = program.start(worlds)
     device = episodes.seed.device
     numbers = torch.arange(len(worlds)) if numbers is None else numbers
@@ -133,7 +135,7 @@ def play(
         if isinstance(policy, ExpertPlayer):
             actions = policy(episodes)
         elif policy is not None:
-            actions = policy(stack.push(sight.of(episodes.world)), keys)
+            actions = policy(stack.push(sight.of(episodes)), keys)
         seen = None
         if recorder is not None:
             seen, recorder.actions = recorder.see, actions
@@ -148,6 +150,27 @@ def play(
         if not bool(going.any()):
             break
     return Played(returns.cpu(), lengths.cpu(), succeeded.cpu())
+
+
+def _play_mixed(
+    program: TaskProgram,
+    policy: Policy | ExpertPlayer | None,
+    worlds: Tensor,
+    observation: str,
+    numbers: Tensor | None,
+    seed: int,
+) -> Played:
+    """`play` where worlds run under different rulesets: ruleset by ruleset."""
+    numbers = torch.arange(len(worlds)) if numbers is None else numbers
+    rulesets, parts, places = program.ruleset_of(worlds), [], []
+    for ruleset in rulesets.unique().tolist():
+        chosen = (rulesets == ruleset).nonzero()[:, 0]
+        player = policy.under(ruleset) if isinstance(policy, ExpertPlayer) else policy
+        how: dict[str, Any] = {"numbers": numbers[chosen], "seed": seed}
+        parts.append(play(program.under(ruleset), player, worlds[chosen], observation=observation, **how))
+        places.append(chosen)
+    order = torch.cat(places).argsort()
+    return Played(*(torch.cat(part)[order] for part in zip(*parts, strict=True)))
 
 
 def evaluate(
@@ -245,7 +268,7 @@ def player(
     `run`: whose policy the trained one is. `deterministic`: it takes the likeliest action.
     """
     if name == "trained" and run is not None:
-        env = TensorEnv(program, 1, observation=config_of(run).observation)
+        env = TensorEnv(program.under(0), 1, observation=config_of(run).observation)
         return load_policy(run, env, deterministic=deterministic)
     if name == "expert":
         return ExpertPlayer(program)
@@ -266,6 +289,10 @@ def _play_all(
 def _starts(program: TaskProgram, worlds: Tensor) -> list[bytes]:
     """Digests of start worlds, elements and fields."""
     digests = []
+    if program.is_mixed:  # the same start under two rulesets is two worlds
+        for world, ruleset in zip(worlds[:, None], program.ruleset_of(worlds).tolist(), strict=True):
+            digests += [b"%d %b" % (ruleset, *_starts(program.under(ruleset), world))]
+        return digests
     for part in worlds.split(BATCH):
         state = [value.cpu().numpy() for value in program.start(part).world.state.values()]
         digests += [sha256(b"".join(map(bytes, rows))).digest() for rows in zip(*state, strict=True)]
@@ -337,9 +364,26 @@ def film(
     There is a picture of the start, and one after each action and each step, free steps included. Worlds whose
     episode is over no longer change.
     """
-    recorder = Film(program.task, len(worlds), factor)
-    played = play(program, policy, worlds, observation=observation, seed=seed, recorder=recorder)
-    return played, recorder.pictures()
+    if not program.is_mixed:
+        recorder = Film(program.task, len(worlds), factor)
+        played = play(program, policy, worlds, observation=observation, seed=seed, recorder=recorder)
+        return played, recorder.pictures()
+    parts, films = [], []
+    for number, ruleset in enumerate(program.ruleset_of(worlds).tolist()):
+        own, player = (
+            program.under(ruleset),
+            policy.under(ruleset) if isinstance(policy, ExpertPlayer) else policy,
+        )
+        place = slice(number, number + 1)
+        recorder = Film(own.task, 1, factor)
+        how: dict[str, Any] = {"observation": observation, "seed": seed, "recorder": recorder}
+        parts.append(play(own, player, worlds[place], numbers=torch.arange(len(worlds))[place], **how))
+        films.append(list(recorder.pictures()))
+    longest = max(map(len, films))
+    scenes = zip(*([*film, *[film[-1]] * (longest - len(film))] for film in films), strict=True)
+    columns = min(4, len(films))
+    pictures = (contact_sheet([*scene], columns=columns) for scene in scenes)
+    return Played(*map(torch.cat, zip(*parts, strict=True))), pictures
 
 
 class Film:

@@ -18,6 +18,7 @@ from torch.distributions import Categorical
 
 from powderdsl.envs.actions import ActionForm, action_form
 from powderdsl.envs.features import paper_policy, patches_of, small_policy
+from powderdsl.envs.mixed import environment
 from powderdsl.envs.tensor_env import TensorEnv
 from powderdsl.experiments.runs import (
     RunFolder,
@@ -310,7 +311,7 @@ def _own_env(run: RunFolder, config: TrainConfig, env: TensorEnv) -> TensorEnv:
     if tuple(run.config.get("channels", ())) == tuple(env.observation.channels):
         return env
     program = compile_task(task_of(run), split=config.split, backend="torch", device=str(env.device))
-    return TensorEnv(program, 1, observation=config.observation)
+    return environment(program, 1, observation=config.observation)
 
 
 def task_of(run: RunFolder, packs: Sequence[str] = ()) -> Task:

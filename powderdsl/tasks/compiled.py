@@ -20,7 +20,8 @@ from powderdsl.model.types import Expr
 from powderdsl.simulation.simulator import World
 from powderdsl.targets.cpp.episodes import MODES, OPS, Fresh, Play
 from powderdsl.targets.cpp.program import NativeProgram, PackedState, Places, Views
-from powderdsl.tasks.episodes import Episodes, TaskProgram
+from powderdsl.targets.layout import parameters
+from powderdsl.tasks.episodes import Episodes, TaskProgram, params_of
 from powderdsl.tasks.goals import ACTION_WORDS
 from powderdsl.tasks.tensors.measures import Masks
 
@@ -79,22 +80,23 @@ class Results(Recycled):
     """What a step gives, a row for each world: see `Results` of episodes.hpp.
 
     Args:
-        worlds: the number of worlds.
-        shape: of one observation.
-        dtype: of observations.
-        keeps_last: whether there are last observations of episodes besides the first ones of the next.
+        memory: `SIZE` bytes for each world.
+        observed: observations, [B, …].
+        last_observed: if they are asked for, the last observations of episodes besides the first ones of the next.
     """
 
-    def __init__(self, worlds: int, shape: tuple[int, ...], dtype: Any, keeps_last: bool):
-        memory = np.empty(36 * worlds, np.uint8)
+    SIZE = 40
+    """Bytes for each world, a multiple of the size of any number."""
+
+    def __init__(self, memory: Any, observed: Any, last_observed: Any = None):
+        worlds = len(observed)
         kinds = (*[np.int64] * 3, *[np.float32] * 2, *[np.bool_] * 4)
         ends = np.cumsum([0] + [worlds * np.dtype(kind).itemsize for kind in kinds])
         rows: list[Any] = [memory[a:b].view(kind) for (a, b), kind in zip(pairwise(ends), kinds, strict=True)]
         self.episode_length, self.world, self.last_world, self.reward, self.episode_return = rows[:5]
         self.terminated, self.truncated, self.success, self.ended = rows[5:]
         self.everyone = np.ones(worlds, np.bool_)
-        self.observed = np.empty((worlds, *shape), dtype)
-        self.last_observed = np.empty((worlds, *shape), dtype) if keeps_last else None
+        self.observed, self.last_observed = observed, last_observed
         names = ("success", "episode_return", "episode_length")
         self.final_info: dict[str, Any] = {
             "world": self.last_world,
@@ -108,12 +110,12 @@ class Results(Recycled):
             **dict.fromkeys(("_success", "_world"), self.everyone),
         }
         """What is said of all."""
-        arrays = [memory, *rows, self.everyone, self.observed]
-        if self.last_observed is not None:
-            arrays.append(self.last_observed)
+        arrays = [memory, *rows, self.everyone, observed]
+        if last_observed is not None:
+            arrays.append(last_observed)
         self.addresses = {"results": memory.ctypes.data, "observed": self.observed.ctypes.data}
         self.addresses["last_observed"] = 0 if self.last_observed is None else self.last_observed.ctypes.data
-        del memory, rows
+        del memory, rows, observed, last_observed
         self.watch(arrays)
 
 
@@ -224,7 +226,7 @@ class Stepper(Plan):
     def bind(self, episodes: Episodes, params: Mapping[str, Tensor], kept: Mapping[str, Tensor]) -> Episodes:
         """Return the episodes in memory that steps write to from now on.
 
-        `params` are float64 [B] each; `kept` are an environment's tensors by the names of `Play`, [B] each: ``episode``,
+        `params` are float64 [B] each, as `TaskProgram.act` takes them; `kept` are an environment's tensors by the names of `Play`, [B] each: ``episode``,
         ``returned``, and ``waiting``, the episodes that are over.
         """
         state, world, worlds = episodes.world.state, episodes.world, len(episodes)
@@ -241,20 +243,21 @@ class Stepper(Plan):
             world=World(self.program.simulator, state, *clock),
             regions={**episodes.regions, **own},
             targets={name: target.clone() for name, target in episodes.targets.items()},
+            params={name: value.clone() for name, value in episodes.params.items()},
             masks=masks,
             **rows,
         )
-        self._has_maps = bool(own or episodes.targets)
-        inputs = self.native.inputs(params, worlds)
+        self._has_maps = bool(own or episodes.targets or episodes.params)
+        self._given = params
+        self._params = self.program.simulator.parameters(params_of(episodes, params) or {}, worlds)
+        self._inputs = inputs = self.native.inputs(self._params, worlds)
         if self.filled is None or len(self.filled) != worlds:
             self.filled, self._ahead = torch.zeros(worlds, dtype=torch.int64), None
         self._now = torch.zeros_like(rows["before"])
         self.begins = torch.zeros(worlds, dtype=torch.bool)
         clocks = zip(("seed", "index", "step"), clock, strict=True)
         rows["world"] = rows.pop("seed")
-        self.numbers = np.empty((worlds, self.play.numbers), np.int64)
-        """The numbers of the next actions."""
-        self._numbers_at = self.numbers.ctypes.data
+        self.read_from(np.empty((worlds, self.play.numbers), np.int64))
         self._results: Results | None = None
         self._tensors: dict[str, Tensor] = {
             **dict(clocks),
@@ -271,7 +274,6 @@ class Stepper(Plan):
         }
         for name, tensor in self._tensors.items():
             setattr(self.play, name, tensor.data_ptr())
-        self._params = params
         self.play.mask_words, self.play.own_masks = masks.words[0].numel(), self.program.meter.own
         return self.episodes
 
@@ -281,6 +283,10 @@ class Stepper(Plan):
             for name, address in results.addresses.items():
                 setattr(self.play, name, address)
             self._results = results
+
+    def read_from(self, numbers: Any) -> None:
+        """Let the next calls read actions from an array, int64 [B, k]."""
+        self.numbers, self._numbers_at = numbers, numbers.ctypes.data
 
     def step(self) -> int:
         """Step with `numbers`. Returns the place of the first number that is out of range, and nothing
@@ -322,7 +328,7 @@ class Stepper(Plan):
         return {name: cells for name, cells in regions.items() if name not in self.program.fixed}
 
     def _copy_maps(self) -> None:
-        """Copy the regions and targets of episodes that have begun."""
+        """Copy the regions, targets and parameters of episodes that have begun."""
         if not self._has_maps or self._ahead is None or not bool(self.begins.any()):
             return
         own = self._own(self.episodes.regions)
@@ -332,6 +338,15 @@ class Stepper(Plan):
             cells[rows] = self._ahead.regions[name][places]
         for name, target in self.episodes.targets.items():
             target[rows] = self._ahead.targets[name][places]
+        if self.episodes.params:
+            for name, drawn in self.episodes.params.items():
+                drawn[rows] = self._ahead.params[name][places]
+            for name, value in (params_of(self.episodes, self._given) or {}).items():
+                self._params[name].copy_(value)
+            own_params = {name: value[rows] for name, value in self._params.items()}
+            layout = self.native.layout
+            bits, floats = parameters(torch, own_params, layout.param_planes, layout.param_reals, len(rows))
+            self._inputs.planes[:, rows], self._inputs.reals[:, rows] = bits, floats
 
     def fill(self, numbers: Callable[[Tensor, Tensor], Tensor]) -> None:
         """Make the start worlds of the next episodes if one that begins lacks its own.

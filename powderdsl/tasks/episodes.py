@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,7 +13,9 @@ from torch import Tensor
 
 from powderdsl.simulation.simulator import Simulator, World
 from powderdsl.simulation.simulator import compile as compile_rules
-from powderdsl.targets.cpp.program import NativeProgram
+from powderdsl.targets.cpp.program import NativeProgram, PackedState
+from powderdsl.tasks.file import task_under
+from powderdsl.tasks.laws import Laws
 from powderdsl.tasks.shipped import check_split, load_task
 from powderdsl.tasks.task import Task
 from powderdsl.tasks.tensors.actions import CLOCK, Hands, put_rows, put_worlds
@@ -40,7 +43,8 @@ class Episodes:
 
     `seed`, int64 [B], says which worlds they started as; `acted`, int64 [B], how many actions each has had;
     `failed`, bool [B], whether `failure` of `end:` holds now. `regions` are bool [B, H, W], or [1, H, W] if all
-    worlds have the same; `targets` uint8 [B, H, W], 255 for no element; `start` and `before`, float64 [B, n], the
+    worlds have the same; `targets` uint8 [B, H, W], 255 for no element; `params`, float64 [B] each, the parameters of the
+    rules that each world has drawn; `start` and `before`, float64 [B, n], the
     measures at the start and after the previous action (not updated if only the last action is rewarded); `masks` are
     regions and targets as counts of packed worlds read them.
     """
@@ -51,6 +55,7 @@ class Episodes:
     failed: Tensor
     regions: Mapping[str, Tensor]
     targets: Mapping[str, Tensor]
+    params: Mapping[str, Tensor]
     masks: Masks
     start: Tensor
     before: Tensor
@@ -60,10 +65,17 @@ class Episodes:
 
 
 class TaskProgram:
-    """A task made executable for one split. Made by `compile_task`."""
+    """A task made executable for one split. Made by `compile_task`.
 
-    def __init__(self, task: Task, split: str, simulator: Simulator):
+    Where the worlds of a split run under different rulesets, episodes belong to the programs that `under` gives.
+    """
+
+    def __init__(self, task: Task, split: str, simulator: Simulator, *, ruleset: int | None = None):
         self.task, self.split, self.simulator = task, split, simulator
+        self.rulesets, self.ruleset = task.split(split).rulesets, ruleset
+        """The rulesets of the split, and the number of the one that this program is under: None if it is under no
+        certain one."""
+        self._under: dict[int, TaskProgram] = {}
         device = simulator.device
         self._starts = StartWorlds(task, split, simulator.kind)
         scalars = scalars_of(task.goal)
@@ -79,6 +91,8 @@ class TaskProgram:
         self._asked = {part.value for part in scalars if part.op == "action"}
         """The numbers of actions that the goal reads."""
         self.hands = Hands(simulator, task.agent, task.size, counts="painted" in self._asked)
+        self.laws = Laws(task, simulator)
+        """What observations can tell of the rules."""
         self.action_nvec = task.agent.action_nvec
         """How many values x, y, choice, vx and vy have. `Task.agent.choices` says what a choice means."""
 
@@ -86,10 +100,37 @@ class TaskProgram:
         """The same program: nothing in it changes, and copies of what uses it share it."""
         return self
 
+    # Rulesets
+
+    @property
+    def is_mixed(self) -> bool:
+        """Whether worlds run under different rulesets, so that this program cannot run them."""
+        return len(self.rulesets) > 0 and self.ruleset is None
+
+    def ruleset_of(self, worlds: Tensor) -> Tensor:
+        """The numbers of the rulesets that worlds run under, int64 [B] of int64 [B]."""
+        return worlds // len(self.task.split(self.split).variants) % max(1, len(self.rulesets))
+
+    def under(self, number: int) -> TaskProgram:
+        """The program of the worlds that run under the ruleset of a number, made when it is first asked for.
+
+        Raises CompileError if the task does not fit that ruleset.
+        """
+        if not self.is_mixed:
+            return self
+        if number not in self._under:
+            task, simulator = task_under(self.task, self.rulesets[number]), self.simulator
+            if task.ruleset != self.task.ruleset:
+                simulator = simulator.of(task.ruleset)
+            self._under[number] = TaskProgram(task, self.split, simulator, ruleset=number)
+        return self._under[number]
+
     # Beginning
 
     def start(self, seeds: Tensor, native: NativeProgram | None = None) -> Episodes:
         """New episodes of the worlds `seeds`, int64 [B], 0 or more each; packed for `native` code if it is given."""
+        if self.is_mixed:
+            raise ValueError(f"the worlds of {self.task.name}, {self.split}, run under different rulesets")
         seeds = torch.as_tensor(seeds, dtype=torch.int64, device=self.simulator.device)
         starts = self._starts.make(seeds)
         nothing = torch.zeros_like(seeds)
@@ -98,9 +139,9 @@ class TaskProgram:
         for name, (values, where) in starts.fields.items():
             state[name] = torch.where(where if values.ndim == 3 else where[:, None], values, state[name])
         world = World(self.simulator, native.pack(state) if native else state, *clock)
-        masks = self.meter.masks(starts.regions, starts.targets)
-        measured = self.meter.take(world, starts.regions, starts.targets, None, masks)
-        flags, maps = nothing.bool(), (starts.regions, starts.targets, masks)
+        masks, params = self.meter.masks(starts.regions, starts.targets), self._starts.params(seeds)
+        measured = self.meter.take(world, starts.regions, starts.targets, params, masks)
+        flags, maps = nothing.bool(), (starts.regions, starts.targets, params, masks)
         return Episodes(world, seeds, nothing.clone(), flags, *maps, measured, measured)
 
     def restart(self, episodes: Episodes, mask: Tensor, seeds: Tensor, *, reuse: bool = False) -> Episodes:
@@ -125,15 +166,35 @@ class TaskProgram:
             put_worlds(episodes.world, places, new.world, reuse=reuse),
             regions={**episodes.regions, **placed(own, new.regions)},
             targets=placed(episodes.targets, new.targets),
+            params=placed(episodes.params, new.params),
             masks=episodes.masks.put(places, new.masks, len(episodes), reuse),
             **placed({name: getattr(episodes, name) for name in ROWS}, vars(new)),
         )
+
+    def select(self, episodes: Episodes, places: Tensor) -> Episodes:
+        """The episodes of numbers `places`, int64 [n], which may repeat."""
+        world, masks, state = episodes.world, episodes.masks, episodes.world.state
+        if isinstance(state, PackedState):
+            state = state.select(places)
+        else:
+            state = {name: value[places] for name, value in state.items()}
+        clock = [getattr(world, name)[places] for name in CLOCK]
+        if len(masks.sizes) == len(episodes):
+            masks = Masks(masks.words[places], masks.sizes[places])
+        maps = {name: getattr(episodes, name) for name in ("regions", "targets", "params")}
+        chosen: dict[str, Any] = {
+            kind: {name: value if name in self.fixed else value[places] for name, value in values.items()}
+            for kind, values in maps.items()
+        }
+        rows = {name: getattr(episodes, name)[places] for name in ROWS}
+        return Episodes(World(self.simulator, state, *clock), **chosen, masks=masks, **rows)
 
     # Saving
 
     def saved(self, episodes: Episodes) -> dict[str, Any]:
         """Episodes as plain tensors in dicts, copies on the CPU, that any backend and device can continue from."""
-        maps = {"state": episodes.world.state, "regions": episodes.regions, "targets": episodes.targets}
+        maps = {name: getattr(episodes, name) for name in ("regions", "targets", "params")}
+        maps["state"] = episodes.world.state
         return {
             **{name: _copy(getattr(episodes, name)) for name in ROWS},
             **{name: {key: _copy(value) for key, value in values.items()} for name, values in maps.items()},
@@ -157,6 +218,7 @@ class TaskProgram:
             world=World(self.simulator, state, seed, index, step),
             regions=regions,
             targets=targets,
+            params=tensors(saved["params"]),
             masks=self.meter.masks(regions, targets),
             **tensors({name: saved[name] for name in ROWS}),
         )
@@ -178,7 +240,7 @@ class TaskProgram:
             actions: None lets the worlds run as if nobody had acted. The action is spent, and nothing is painted,
                 placed or blown.
             reuse: the tensors of `episodes` are written to, and must not be used afterwards.
-            params: parameters of the rules for this action, one number each or [B].
+            params: parameters of the rules for this action, one number each or [B]; NaN leaves what the world drew.
             seen: called with the worlds after the action and after each step, which then run one at a time. Free steps
                 are shown where all episodes have them. Not with `reuse`.
 
@@ -187,7 +249,7 @@ class TaskProgram:
             success, failure, or no action left. With the last action the free steps have run.
         """
         agent, goal = self.task.agent, self.task.goal
-        world = episodes.world
+        world, params = episodes.world, params_of(episodes, params)
         if actions is not None:
             world, done = self.hands.act(world, actions, reuse=reuse)
         else:
@@ -223,6 +285,10 @@ class TaskProgram:
         after = replace(episodes, world=world, acted=acted, failed=failed, before=now)
         return after, reward.float(), success, over
 
+    def told(self, episodes: Episodes) -> Tensor:
+        """The laws that observations of episodes tell, uint8 [B, n]: see `Laws`."""
+        return self.laws.of(episodes.params, len(episodes)).to(episodes.seed.device)
+
     @property
     def block_edges(self) -> tuple[Tensor, Tensor]:
         """The rows, then the columns, of the blocks that actions change: first and past the last, int64 [bins, 2]."""
@@ -230,7 +296,8 @@ class TaskProgram:
 
     def measured(self, episodes: Episodes, params: Params = None) -> Tensor:
         """The current values of `measures`: float64 [B, n]."""
-        return self.meter.take(episodes.world, episodes.regions, episodes.targets, params, episodes.masks)
+        places = episodes.regions, episodes.targets
+        return self.meter.take(episodes.world, *places, params_of(episodes, params), episodes.masks)
 
     def _run(self, world: World, steps: int, params: Params, reuse: bool, seen: Seen) -> World:
         """The worlds after some steps, which run one at a time if they are to be seen."""
@@ -258,8 +325,37 @@ class TaskProgram:
         return world.with_state(state, start=world.step.index_copy(0, places, ahead.step), since=0)
 
 
+def params_of(episodes: Episodes, params: Params) -> Params:
+    """The parameters of a step that are not the rules' own: those that worlds have drawn, unless `params` has others."""
+    chosen = dict(params or {})
+    for name, drawn in episodes.params.items():
+        value = torch.as_tensor(chosen.get(name, torch.nan), dtype=torch.float64, device=drawn.device)
+        chosen[name] = torch.where(value.isnan(), drawn, value)
+    return chosen or None
+
+
 def _copy(tensor: Tensor, device: torch.device | str = "cpu") -> Tensor:
     return tensor.detach().to(device, copy=True)
+
+
+def load_program(
+    task: str | Path | Task | TaskProgram,
+    *,
+    split: str = "train",
+    knobs: Mapping[str, int] | None = None,
+    params: Mapping[str, Any] | None = None,
+    **machine: Any,
+) -> TaskProgram:
+    """The program of a task, for arguments of an environment; a program is returned as it is.
+
+    `machine`: backend, device and threads, as `compile_task` takes them. Raises CompileError as `compile_task`, and
+    ValueError for knobs or parameters of a task that is loaded already.
+    """
+    if isinstance(task, Task | TaskProgram) and (knobs or params):
+        raise ValueError("knobs and params are given to `load_task` where the task is loaded before")
+    if isinstance(task, str | Path):
+        task = load_task(task, knobs=knobs, params=params)
+    return compile_task(task, split=split, **machine) if isinstance(task, Task) else task
 
 
 def compile_task(

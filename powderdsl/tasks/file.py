@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from itertools import count
@@ -11,6 +12,7 @@ from powderdsl.compiler import load_with_diagnostics, names_in_file, read
 from powderdsl.diagnostics import CompileError, Reporter, Source, suggest
 from powderdsl.model.check import resolve_names
 from powderdsl.model.composition.compose import Palette
+from powderdsl.model.definitions import describe_kind, param_value
 from powderdsl.model.expressions.symbols import report_unknown_names
 from powderdsl.model.expressions.typer import Typer
 from powderdsl.model.operations import FUNCTIONS as RULE_FUNCTIONS
@@ -35,7 +37,7 @@ from powderdsl.tasks.drawings import (
     shape_in,
 )
 from powderdsl.tasks.goals import ACTION_WORDS, FUNCTIONS, GoalChecker
-from powderdsl.tasks.task import MAX_SIDE, Goal, Knob, Split, Task
+from powderdsl.tasks.task import MAX_SIDE, Goal, Knob, Origin, ParamRange, Split, Task
 from powderdsl.worlds.raster import Size
 from powderdsl.worlds.scene.read import two_integers
 from powderdsl.worlds.scene.statements import Statement, Written, number, read_amount, report_unknown
@@ -60,6 +62,19 @@ class EndDecl(Record, noun="an end"):
     failure: Syntax | None = keyed("the episode ends, and the task is not done")
 
 
+class Laws(Record):
+    """What rules worlds run under."""
+
+    params: tuple[tuple[Scalar, Scalar], ...] = keyed(
+        "other values for the rules' parameters; of a range, such as `1%..20%`, each world draws its own",
+        (),
+        maps="parameters to values or ranges",
+    )
+    rulesets: tuple[Scalar, ...] = keyed(
+        "rules in place of `rules`; world after world takes the next. `universe:0..63` are 64 of them", ()
+    )
+
+
 class Variant(Record):
     """Changes of a task's worlds."""
 
@@ -74,14 +89,14 @@ class StandDecl(Variant, noun="a stand"):
     about: str = keyed("what it shows, in a sentence", "")
 
 
-class SplitDecl(Variant, Entry, noun="a split"):
+class SplitDecl(Variant, Laws, Entry, noun="a split"):
     about: str = keyed("what it is for, in a sentence", "")
     stands: Node | None = keyed(
         "fixed worlds: a list of such changes, each with a name under `stand`", shape="list"
     )
 
 
-class TaskDecl(Record, noun="a task"):
+class TaskDecl(Laws, noun="a task"):
     """A task's file as written."""
 
     name: str = keyed("the task's name", "", name="task", required=True, form=NAME_FORM)
@@ -89,9 +104,6 @@ class TaskDecl(Record, noun="a task"):
     family: str = keyed("what tasks of its kind have in common, such as `build` or `herd`", "", shape="word")
     rules: Scalar | None = keyed(
         "the rules of its worlds: a shipped ruleset, packs joined by `+`, or a file", required=True
-    )
-    params: tuple[tuple[Scalar, Scalar], ...] = keyed(
-        "other values for the rules' parameters", (), maps="parameters to values"
     )
     size: Node | None = keyed("[rows, columns]", required=True)
     fill: Scalar | None = keyed("the element that is everywhere before anything is drawn", required=True)
@@ -113,6 +125,17 @@ class TaskDecl(Record, noun="a task"):
     splits: tuple[SplitDecl, ...] = keyed("other sets of worlds beside `train`", ())
 
 
+RANGE = ".."
+"""Between the ends of a range."""
+
+NUMBERS = re.compile(r"([0-9]{1,10})\.\.([0-9]{1,10})")
+
+MAX_RULESETS = 1 << 16
+"""Rulesets of one split."""
+
+Drawn = tuple[dict[str, ParamRange], tuple[tuple[str, ...], ...]]
+"""The parameters and the rulesets of a split."""
+
 MAX_VARIANTS = 256
 """Worlds that the stands of one split may have."""
 
@@ -125,11 +148,12 @@ def read_task(
     params: Mapping[str, Any] | None = None,
     packs: Sequence[str] = (),
     palette: Palette | None = None,
+    rules: Sequence[str] | None = None,
 ) -> Task:
     """The checked task of a file's text; warnings stay with the reporter.
 
-    `packs` are added to its rules; `palette` has ids that were recorded. Raises CompileError with everything that is
-    wrong in the file, and in its rules.
+    `packs` are added to its rules, which `rules` replace; `palette` has ids that were recorded. Raises CompileError with
+    everything that is wrong in the file, and in its rules.
     """
     tree = read_tree(source, reporter, "a task starts with `task: NAME`")
     reporter.raise_if_errors()
@@ -141,9 +165,12 @@ def read_task(
     if decl is None or word is None or names is None:
         reporter.raise_if_errors()
         raise AssertionError("a task without rules was not reported")
-    rules, written = (*names, *packs), {name.text: value.text for name, value in decl.params}
+    given = params or {}
+    written = {name.text: value.text for name, value in decl.params if RANGE not in value.text}
+    origin = Origin(source, dict(knobs or {}), dict(given), tuple(packs))
+    rules = (*(rules or names), *packs)
     try:
-        ruleset, _ = load_with_diagnostics(*rules, params={**written, **(params or {})}, palette=palette)
+        ruleset, _ = load_with_diagnostics(*rules, params={**written, **given}, palette=palette)
     except CompileError as error:
         pass_on(error, reporter, word.span)
         reporter.raise_if_errors()
@@ -151,7 +178,16 @@ def read_task(
     loaded, composed = read(rules, Reporter())
     typer, _ = resolve_names(loaded, composed, Reporter(), palette)
     typer.reporter = reporter
-    return _TaskReader(reader, decl, ruleset, typer, rules, knobs or {}).task()
+    return _TaskReader(reader, decl, ruleset, typer, rules, origin).task()
+
+
+def task_under(task: Task, rules: Sequence[str]) -> Task:
+    """The same task, read under other rules, as `compiler.load` takes them. Raises CompileError if they do not fit."""
+    origin = task.origin
+    assert origin is not None
+    knobs, params, packs = origin.knobs, origin.params, origin.packs
+    other = read_task(origin.source, Reporter(), knobs=knobs, params=params, packs=packs, rules=rules)
+    return other.with_shaped_reward() if origin.shaped else other
 
 
 class _TaskReader:
@@ -164,10 +200,11 @@ class _TaskReader:
         ruleset: Ruleset,
         typer: Typer,
         rules: tuple[str, ...],
-        values: Mapping[str, int],
+        origin: Origin,
     ):
         self.reader, self.reporter, self.decl = reader, reader.reporter, decl
-        self.ruleset, self.typer, self.rules, self.values = ruleset, typer, rules, values
+        self.ruleset, self.typer, self.rules, self.values = ruleset, typer, rules, origin.knobs
+        self.origin = origin
         own, _ = read(rules[:1], Reporter())
         self.own = {pack.name.text for pack in own}
         """The packs of the task's own rules: it does not know the names of added ones."""
@@ -220,6 +257,7 @@ class _TaskReader:
             expert,
             self.rules,
             decl.family,
+            self.origin,
         )
 
     # What worlds are made of
@@ -316,7 +354,8 @@ class _TaskReader:
 
     def splits(self, plan: DrawingPlan, size: Size) -> tuple[tuple[Split, ...], set[str]]:
         """All splits, and the parts that any of them uses."""
-        plans = [("train", self.decl.about, [plan])]
+        train = self.params(self.decl.params, {}), self.rulesets(self.decl.rulesets)
+        plans = [("train", self.decl.about, [plan], train)]
         for decl in self.decl.splits:
             base = self.varied(plan, decl, decl.name.text)
             if decl.name.text == "train":
@@ -325,13 +364,76 @@ class _TaskReader:
                 message = "the split `train` is there already"
                 self.reporter.error("PD302", message, decl.name.span, label, helps=helps)
             variants = [base] if decl.stands is None else self.stands(base, decl.stands)
-            plans.append((decl.name.text, decl.about, variants))
+            laws = self.params(decl.params, train[0]), self.rulesets(decl.rulesets) or train[1]
+            plans.append((decl.name.text, decl.about, variants, laws))
+            self.held_out(decl, train, laws)
         splits, used, visits = [], set(), count()
-        for name, about, variants in plans:
+        for name, about, variants, (params, rulesets) in plans:
             drawers = [Drawer(variant, self.ruleset, size, self.reporter, visits) for variant in variants]
-            splits.append(Split(name, about, tuple(drawer.generator() for drawer in drawers)))
+            generators = tuple(drawer.generator() for drawer in drawers)
+            splits.append(Split(name, about, generators, tuple(params.values()), rulesets))
             used |= {part for drawer in drawers for part in drawer.used_parts}
         return tuple(splits), used
+
+    def params(
+        self, entries: Sequence[tuple[Scalar, Scalar]], train: Mapping[str, ParamRange]
+    ) -> dict[str, ParamRange]:
+        """The parameters that worlds draw: those of `train` and of some entries, except what was set from outside."""
+        known = {param.name: param for param in self.ruleset.params}
+        ranges = dict(train)
+        for name, value in entries:
+            if name.text not in known:
+                report_unknown("parameter", name, known, self.reporter)
+                continue
+            if name.text in self.origin.params or (entries is self.decl.params and RANGE not in value.text):
+                continue
+            kind, (low, dots, high) = known[name.text].kind, value.text.partition(RANGE)
+            ends = [param_value(kind, end) for end in (low, high if dots else low)]
+            if None in ends or ends[0] > ends[1]:  # type: ignore[operator]  # of two numbers
+                message = f"the parameter `{name.text}` cannot be `{value.text}`"
+                helps = [f"write {describe_kind(kind)}, or a range of two, the smaller first: `LOW..HIGH`"]
+                self.reporter.error("PD402", message, value.span, "not such a value", helps=helps)
+                continue
+            first, last = (float(end) for end in ends)  # type: ignore[arg-type]  # None is reported
+            ranges[name.text] = ParamRange(name.text, first, last, kind.name in ("int", "flag"))
+        return ranges
+
+    def rulesets(self, words: Sequence[Scalar]) -> tuple[tuple[str, ...], ...]:
+        """The rules of each word; a range of numbers in it stands for each of them."""
+        rulesets: list[tuple[str, ...]] = []
+        for word in words:
+            numbers = NUMBERS.search(word.text)
+            texts = [word.text]
+            if numbers is not None:
+                first, last = map(int, numbers.groups())
+                if not 0 <= last - first < MAX_RULESETS:
+                    message = f"`{numbers[0]}` stands for no rulesets, or more than {MAX_RULESETS:,}"
+                    self.reporter.error("PD801", message, word.span, "the smaller number first")
+                    continue
+                before, after = word.text[: numbers.start()], word.text[numbers.end() :]
+                texts = [f"{before}{number}{after}" for number in range(first, last + 1)]
+            names = [names_in_file(text, word.span, self.reporter) for text in (texts[0], texts[-1])]
+            if None not in names:
+                rulesets += [tuple(names_in_file(text, word.span, self.reporter) or ()) for text in texts]
+        return tuple(rulesets[:MAX_RULESETS])
+
+    def held_out(self, decl: SplitDecl, train: Drawn, own: Drawn) -> None:
+        """Report laws of a split that training shows too."""
+        shown = {*train[1]} or {self.rules}
+        if decl.rulesets and (common := [rules for rules in own[1] if rules in shown]):
+            names = ", ".join("+".join(rules) for rules in common[:3])
+            label, helps = f"{names}: also in `train`", ["choose rules that training does not show"]
+            message = f"the split `{decl.name.text}` has {len(common)} rulesets of `train`"
+            self.reporter.report("PD807", message, decl.rulesets[0].span, label, helps=helps)
+        for name, value in decl.params:
+            usual = train[0].get(name.text)
+            drawn = own[0].get(name.text)
+            if usual and drawn and drawn.low <= usual.high and usual.low <= drawn.high:
+                label = f"`train` draws from {usual.low:g}..{usual.high:g}"
+                message = f"the split `{decl.name.text}` draws values of `{name.text}` that `train` draws too"
+                self.reporter.report(
+                    "PD807", message, value.span, label, helps=["choose ranges that are apart"]
+                )
 
     def stands(self, base: DrawingPlan, node: Node) -> list[DrawingPlan]:
         if not isinstance(node, yaml_tree.Sequence) or not node.items:

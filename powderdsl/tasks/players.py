@@ -8,6 +8,7 @@ from torch import Tensor
 from powderdsl.system.random import action_keys, uniforms
 from powderdsl.tasks.episodes import Episodes, TaskProgram
 from powderdsl.tasks.goals import parts_of
+from powderdsl.tasks.mixed import MixedEpisodes
 from powderdsl.tasks.task import ExpertMove
 from powderdsl.tasks.tensors.measures import Facts, Meter, measures_in, scalar_value
 from powderdsl.worlds.raster import mask
@@ -30,6 +31,7 @@ class ExpertPlayer:
         if expert is None:
             raise ValueError(f"the task {program.task.name} has no expert")
         self.program, self.expert = program, expert
+        self._under: dict[int, ExpertPlayer] = {}
         scalars = [part for move in expert.moves if move.condition for part in parts_of(move.condition)]
         most = [move.most for move in expert.moves if move.most is not None]
         self.measures = tuple(dict.fromkeys([*most, *measures_in(scalars)]))
@@ -39,8 +41,18 @@ class ExpertPlayer:
         self._plans: dict[int, Tensor] = {}
         """Of a search: int64 [actions, 5] by world."""
 
-    def __call__(self, episodes: Episodes) -> Tensor:
+    def under(self, ruleset: int) -> ExpertPlayer:
+        """The player of the worlds under a ruleset, by its number, where they run under different ones."""
+        if not self.program.is_mixed:
+            return self
+        if ruleset not in self._under:
+            self._under[ruleset] = ExpertPlayer(self.program.under(ruleset))
+        return self._under[ruleset]
+
+    def __call__(self, episodes: Episodes | MixedEpisodes) -> Tensor:
         """The actions of some episodes, int64 [B, 5]."""
+        if isinstance(episodes, MixedEpisodes):
+            return episodes.joined(lambda program, part: self.under(program.ruleset or 0)(part))
         if self.expert.search:
             seeds, last = episodes.seed.tolist(), self.program.task.agent.actions - 1
             new = [seed for seed in dict.fromkeys(seeds) if seed not in self._plans]
@@ -50,7 +62,7 @@ class ExpertPlayer:
             steps = zip(seeds, episodes.acted.tolist(), strict=True)
             return torch.stack([self._plans[seed][min(step, last)] for seed, step in steps])
         places = episodes.regions, episodes.targets
-        now = self._meter.take(episodes.world, *places, None, self._meter.masks(*places))
+        now = self._meter.take(episodes.world, *places, episodes.params, self._meter.masks(*places))
         left = self.program.task.agent.actions - episodes.acted
         facts = Facts(self._numbers, now, now, now, {"taken": episodes.acted, "left": left})
         actions = torch.zeros(len(episodes), 5, dtype=torch.int64, device=now.device)

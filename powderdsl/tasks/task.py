@@ -5,10 +5,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-from powderdsl.diagnostics import Span
+from powderdsl.diagnostics import Source, Span
 from powderdsl.model.state import Slot
 from powderdsl.model.types import Expr, Ruleset
 from powderdsl.system.settings import UNMEANING
@@ -127,12 +128,28 @@ class Generator:
 
 
 @dataclass(frozen=True)
+class ParamRange:
+    """A parameter of the rules that each world draws: uniformly from `low` to `high`; integers if `whole`."""
+
+    name: str
+    low: float
+    high: float
+    whole: bool
+
+
+@dataclass(frozen=True)
 class Split:
-    """A set of worlds: world `seed` comes from variant ``seed mod len(variants)``. Fixed scenes are variants."""
+    """A set of worlds, their start and their laws. Fixed scenes are variants.
+
+    World n comes from variant ``n mod len(variants)``, and runs under ruleset ``n div len(variants) mod len(rulesets)``.
+    """
 
     name: str
     about: str
     variants: tuple[Generator, ...]
+    params: tuple[ParamRange, ...] = ()
+    rulesets: tuple[tuple[str, ...], ...] = ()
+    """Rules as `compiler.load` takes them; if there are none, all worlds have the task's own."""
 
 
 @dataclass(frozen=True)
@@ -234,6 +251,18 @@ class Expert:
 
 
 @dataclass(frozen=True)
+class Origin:
+    """What a task was read from: to read it again under other rules."""
+
+    source: Source
+    knobs: Mapping[str, int]
+    params: Mapping[str, Any]
+    packs: tuple[str, ...]
+    shaped: bool = False
+    """Whether its `shaped` reward has taken the place of the others."""
+
+
+@dataclass(frozen=True)
 class Task:
     """A checked task. `knobs` are filled in; `ruleset` has the task's parameters."""
 
@@ -250,12 +279,14 @@ class Task:
     """The rules that were loaded, as `compiler.load` takes them."""
     family: str = field(default="", metadata=UNMEANING)
     """A word for tasks of one kind; empty if the file has none."""
+    origin: Origin | None = field(default=None, compare=False, repr=False)
 
     def with_shaped_reward(self) -> Task:
         """The same task with its `shaped` reward: worlds, actions and ends stay. Raises ValueError if it has none."""
         if self.goal.shaped is None:
             raise ValueError(f"the task {self.name} has no `shaped` reward")
-        return replace(self, goal=replace(self.goal, each=self.goal.shaped, final=None, shaped=None))
+        goal = replace(self.goal, each=self.goal.shaped, final=None, shaped=None)
+        return replace(self, goal=goal, origin=self.origin and replace(self.origin, shaped=True))
 
     def split(self, name: str) -> Split:
         """The split of a name. Raises KeyError."""

@@ -299,7 +299,7 @@ def test_a_saved_environment_goes_on_as_it_would_have(small: TaskProgram, mode: 
     for action in actions[:4]:
         over = torch.logical_or(*stepped(first, action, over)[2:4])
     saved = first.state()
-    assert torch.equal(second.restore(copy.deepcopy(saved)), first.observation.of(first.episodes.world))
+    assert torch.equal(second.restore(copy.deepcopy(saved)), first.observation.of(first.episodes))
     third.restore(saved)
     for action in actions[4:]:
         found, expected = (stepped(env, action, over) for env in (second, first))

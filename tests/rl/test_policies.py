@@ -102,7 +102,7 @@ def test_scores_are_those_of_a_loop_by_hand(
 ) -> None:
     found = evaluate(run, episodes=6, splits=["train"], deterministic=deterministic, seed=9)
     policy = load_policy(run, TensorEnv(program, 1), deterministic=deterministic)
-    sight = observation_of("ids", program.simulator, program.task.size)
+    sight = observation_of("ids", program)
     acts = {"trained": policy, "random": random_policy(program.action_nvec), "nothing": None}
     by_hand = {}
     for name, act in acts.items():
@@ -111,7 +111,7 @@ def test_scores_are_those_of_a_loop_by_hand(
             episodes, total = program.start(torch.tensor([world])), 0.0
             for step in range(4):
                 key = action_keys(9, torch.tensor([world]), step)
-                actions = None if act is None else act(sight.of(episodes.world), key)
+                actions = None if act is None else act(sight.of(episodes), key)
                 episodes, reward, _, over = program.act(episodes, actions)
                 total += float(reward[0])
                 if over[0]:

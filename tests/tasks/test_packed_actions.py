@@ -39,7 +39,7 @@ def test_packed_worlds_are_acted_on_observed_and_restarted_alike(torch, backend,
     text = TASK.replace("SIZE", size).replace("painted + count(sand) + 100 * placed", each)
     task = read_task(Source("packed.yaml", text), Reporter())
     native, plain = (compile_task(task, backend=name) for name in (backend, "wasm"))
-    observations = [observation_of(kind, native.simulator, task.size) for kind in ("ids", "compact")]
+    observations = [observation_of(kind, native) for kind in ("ids", "compact")]
     for batch, reuse in ((1, True), (3, False), (20, True), (20, False)):
         one, other = native.start(torch.arange(batch)), plain.start(torch.arange(batch))
         random = torch.Generator().manual_seed(batch)
@@ -61,7 +61,7 @@ def test_packed_worlds_are_acted_on_observed_and_restarted_alike(torch, backend,
                 assert reuse or torch.equal(native.simulator.step(acted.world, 0).ids, kept)
             assert one.world.step.tolist() == other.world.step.tolist()
             for observation in observations:
-                assert torch.equal(observation.of(one.world), observation.of(other.world))
+                assert torch.equal(observation.of(one), observation.of(other))
             for name, value in other.world.state.items():
                 assert torch.equal(one.world.state[name], value), name
             for name, value in before.items():

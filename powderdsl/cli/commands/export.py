@@ -55,9 +55,9 @@ def command(
         if size is not None:
             raise BadInput("--size goes with rules: a task has its own")
         from powderdsl.envs.header import c_environment
-        from powderdsl.envs.tensor_env import TensorEnv
+        from powderdsl.envs.mixed import environment
 
-        env = TensorEnv(rules, params=settings, **how)
+        env = environment(rules, params=settings, **how)
         texts, source = c_environment(env, worlds, out.name), out.with_suffix(".cpp")
         write_text(source, texts.source)
         write_text(out, texts.header)

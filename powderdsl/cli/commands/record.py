@@ -140,11 +140,11 @@ def _trained(run: RunFolder, task: Task, how: dict[str, Any]) -> dict[str, Any]:
 
     Raises CompileError (PD620), and ValueError if the run does not fit.
     """
-    from powderdsl.envs.tensor_env import TensorEnv
+    from powderdsl.envs.mixed import environment
     from powderdsl.rl.policies import config_of, load_policy
 
     sees = config_of(run).observation
     where = {name: how[name] for name in ("split", "backend", "device")}
-    env = TensorEnv(task, 1, observation=sees, **where)
+    env = environment(task, 1, observation=sees, **where)
     name = f"{run.path.name}, checkpoint {run.checkpoint().path.stem}"
     return {"policy": load_policy(run, env), "policy_name": name, "sees": sees}

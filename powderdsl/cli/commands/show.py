@@ -23,7 +23,7 @@ from powderdsl.system.reports import Painted, table
 from powderdsl.tasks.shipped import is_task
 
 if TYPE_CHECKING:
-    from powderdsl.tasks.task import Task
+    from powderdsl.tasks.task import Split, Task
 
 
 @click.command("show")
@@ -232,7 +232,11 @@ def _of_task(task: Task) -> tuple[dict[str, Any], Tables]:
         "agent": Shown("; ".join(_agent_text(task)), task.agent),
     }
     splits = [
-        {**_described(split, "name", "about"), "stands": [stand.name for stand in split.variants]}
+        {
+            **_described(split, "name", "about"),
+            "stands": [stand.name for stand in split.variants],
+            "laws": _laws(split),
+        }
         for split in task.splits
     ]
     knobs = [
@@ -245,6 +249,16 @@ def _of_task(task: Task) -> tuple[dict[str, Any], Tables]:
         for knob in task.knobs
     ]
     return head, {"splits": splits, "knobs": knobs}
+
+
+def _laws(split: Split) -> Shown:
+    """The parameters and rulesets that a split's worlds draw."""
+    ranges = {part.name: [part.low, part.high] for part in split.params}
+    texts = [f"{name} {low:g}..{high:g}" for name, (low, high) in ranges.items()]
+    if split.rulesets:
+        first, last = ("+".join(rules) for rules in (split.rulesets[0], split.rulesets[-1]))
+        texts.append(f"{len(split.rulesets)} rulesets: {first}" + (f" … {last}" if first != last else ""))
+    return Shown(", ".join(texts), {"params": ranges, "rulesets": [*map(list, split.rulesets)]})
 
 
 def _step_text(task: Task, split: str) -> str:
@@ -292,15 +306,22 @@ def _write_sheet(task: Task, split: str, worlds: int, out: Path) -> None:
     from powderdsl.worlds.media import write_png
 
     program = compile_task(task, split=split, backend="torch")
-    episodes = program.start(torch.arange(worlds))
-    drawn = episodes.world.rgb().numpy()
+    numbers = torch.arange(worlds)
+    if program.is_mixed:
+        rulesets = enumerate(program.ruleset_of(numbers).tolist())
+        parts = [program.under(ruleset).start(numbers[[world]]) for world, ruleset in rulesets]
+    else:
+        parts = [program.start(numbers)]
+    drawn = torch.cat([part.world.rgb() for part in parts]).numpy()
+    regions = {name: [part.regions[name] for part in parts] for name in parts[0].regions}
     columns = math.ceil(math.sqrt(worlds))
     longest = max(task.size) * columns
     factor = max(2, min(8, 2 * USUAL_SIDE // longest))
     if longest * factor > MAX_SIDE:
         raise BadInput(f"a picture of {longest * factor:,} pixels a side: show fewer --worlds")
     images = scale(drawn, factor)
-    for color, masks in zip(cycle(OUTLINES), episodes.regions.values(), strict=False):
+    for color, cells in zip(cycle(OUTLINES), regions.values(), strict=False):
+        masks = torch.cat(cells).numpy()
         for world, image in enumerate(images):
-            outline(image, masks[world % len(masks)].numpy(), factor, color)
+            outline(image, masks[world % len(masks)], factor, color)
     write_png(out, contact_sheet(images, columns=columns))

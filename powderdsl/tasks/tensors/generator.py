@@ -396,6 +396,21 @@ class StartWorlds:
             if all(name in named and bool((value == named[name]).all()) for named in cells)
         }
         """Regions that are the same in all worlds of the split, bool [1, H, W]."""
+        self._params = task.split(split).params
+
+    def params(self, seeds: Array) -> dict[str, Array]:
+        """The parameters that worlds draw, float64 [B] each, by name."""
+        hashes, counter, xp = Hashes(seeds, self.kind), self.kind.arange(1), self.kind.xp
+        values = {}
+        for part in self._params:
+            number = hashes.draw(name_number(part.name), counter)[:, 0]
+            if part.whole:
+                value = int(part.low) + (number * int(part.high - part.low + 1) >> 32)
+            else:
+                value = part.low + (part.high - part.low) * (xp.asarray(number, dtype=xp.float64) / 2**32)
+            # As exact as parameters that a caller gives.
+            values[part.name] = xp.asarray(xp.asarray(value, dtype=xp.float32), dtype=xp.float64)
+        return values
 
     def make(self, seeds: Array) -> Made:
         """The start worlds of seeds, int64 [B]; where the split has several variants, each world comes from its own."""

@@ -1,0 +1,329 @@
+"""Environments whose worlds run under different rulesets. `environment` makes them, and the others."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from gymnasium.error import ResetNeeded
+from gymnasium.vector import AutoresetMode
+from torch import Tensor
+
+from powderdsl.envs.compiled import CompiledEnv, Steps, tensors_of
+from powderdsl.envs.tensor_env import Info, TensorEnv, check_going, world_seeds
+from powderdsl.tasks.compiled import Recycled, Results, Stepper
+from powderdsl.tasks.episodes import TaskProgram, load_program
+from powderdsl.tasks.mixed import MixedEpisodes, joined
+from powderdsl.tasks.task import Task
+
+Array = np.ndarray[Any, Any]
+
+
+def environment(task: str | Path | Task | TaskProgram, num_envs: int = 1, **how: Any) -> CompiledEnv:
+    """Return a `MixedEnv` where the worlds of a split run under different rulesets, else a `CompiledEnv`.
+
+    Arguments and errors are those of `TensorEnv`.
+    """
+    names = ("split", "knobs", "params", "backend", "device", "threads")
+    program = load_program(task, **{name: how.pop(name) for name in names if name in how})
+    return (MixedEnv if program.is_mixed else CompiledEnv)(program, num_envs, **how)
+
+
+COLUMNS = (
+    "observed",
+    "reward",
+    "terminated",
+    "truncated",
+    "success",
+    "episode_return",
+    "episode_length",
+)
+"""What a step of some episodes gives, a row for each: names of `Results`."""
+
+
+class Shown(Recycled):
+    """Observations in the order of environments."""
+
+    def __init__(self, observed: Array):
+        self.observed = observed
+        del observed
+        self.watch([self.observed])
+
+
+class Joint:
+    """Steps the episodes of several steppers, one call each, into one memory.
+
+    Args:
+        steppers: in order.
+        members: the numbers of their episodes, int64 [B].
+        shape: of one observation.
+        dtype: of observations.
+    """
+
+    def __init__(self, steppers: Sequence[Stepper], members: Array, shape: tuple[int, ...], dtype: Any):
+        self._steppers, self._members = steppers, members
+        order, sizes = np.argsort(members), [len(stepper.begins) for stepper in steppers]
+        self._order = order
+        self._numbers = np.empty((len(members), steppers[0].play.numbers), np.int64)
+        self._observed = np.zeros((len(members), *shape), dtype)
+        self._shown: list[Shown] = []
+        ends = np.cumsum([0, *sizes])
+        memory = np.empty(int(Results.SIZE * ends[-1]), np.uint8)
+        columns: list[list[Array]] = [[] for _ in COLUMNS[1:]]
+        for stepper, start, end in zip(steppers, ends, ends[1:], strict=False):
+            part = Results(memory[Results.SIZE * start : Results.SIZE * end], self._observed[start:end])
+            stepper.write_to(part)
+            stepper.read_from(self._numbers[start:end])
+            for column, name in zip(columns, COLUMNS[1:], strict=True):
+                column.append(getattr(part, name))
+        self._places = [(memory.view(column[0].dtype), _places(memory, column)[order]) for column in columns]
+
+    def step(self, actions: Array) -> list[Array]:
+        """Step all episodes: the columns of `COLUMNS`, in the order of their numbers."""
+        np.take(actions.reshape(self._numbers.shape), self._members, 0, self._numbers, mode="clip")
+        for stepper in self._steppers:
+            stepper.step()
+        shown = next(filter(Shown.is_free, self._shown), None)
+        if shown is None:
+            shown = Shown(np.empty_like(self._observed))
+            self._shown = [shown, *self._shown[:2]]
+        np.take(
+            self._observed, self._order, 0, shown.observed, mode="clip"
+        )  # any other mode copies once more
+        return [shown.observed, *(values[places] for values, places in self._places)]
+
+
+def _places(memory: Array, parts: Sequence[Array]) -> Array:
+    """Where in some memory, seen as numbers of the parts' dtype, each number of the parts lies: int64 [B]."""
+    start = memory.ctypes.data
+    return np.concatenate(
+        [(part.ctypes.data - start) // part.itemsize + np.arange(len(part)) for part in parts]
+    )
+
+
+class MixedEnv(CompiledEnv):
+    """A `TensorEnv` whose worlds run under different rulesets.
+
+    The number of an episode's world decides its ruleset (`TaskProgram.ruleset_of`). The episodes under one ruleset step
+    as a `CompiledEnv` of their own, and do what they would do alone. Its code is compiled when the first of them begins.
+
+    Raises:
+        ValueError: under one of the rulesets, observations or actions have another shape. It can come from `reset` and
+            `step`, where a ruleset is first needed.
+    """
+
+    takes_mixed = True
+
+    def __init__(self, task: str | Path | Task | TaskProgram, num_envs: int = 1, **how: Any):
+        super().__init__(task, num_envs, **how)
+        self._envs: dict[int, CompiledEnv] = {}
+        self._groups: dict[int, tuple[CompiledEnv, Array]] = {}
+        """By the number of a ruleset: the environment of its episodes, and which ones they are, int64 [n]."""
+        self._order = np.arange(num_envs)
+        """Where in the groups, one after another, each episode is."""
+
+    def _env(self, number: int, worlds: int) -> CompiledEnv:
+        if number not in self._envs:
+            env = CompiledEnv(
+                self.program.under(number),
+                worlds,
+                observation=self.observation.kind,
+                autoreset_mode="disabled",
+                last_action="terminates" if self.last_action_terminates else "truncates",
+                max_episode_steps=self.max_episode_steps,
+                actions=self.action_form.kind,
+            )
+            ours, theirs = (
+                (each.observation.channels, each.single_action_space, each.action_form.table.tolist())
+                for each in (self, env)
+            )
+            if ours[:2] != theirs[:2]:
+                rules = "+".join(self.program.rulesets[number])
+                raise ValueError(f"{self.task.name}: observations or actions are others under {rules}")
+            self._envs[number] = env
+        return self._envs[number]
+
+    # Beginning
+
+    def reset(
+        self, *, seed: int | Sequence[int | None] | None = None, options: Mapping[str, Any] | None = None
+    ) -> tuple[Tensor, Info]:
+        """Begin all episodes, or those of a mask: see `TensorEnv.reset`."""
+        return TensorEnv.reset(self, seed=seed, options=options)
+
+    def _restart(self, mask: Tensor, worlds: Tensor) -> None:
+        """Begin episodes where `mask`, bool [B], is set, in the worlds of those numbers, int64 [B]."""
+        rows = mask.nonzero()[:, 0].numpy()
+        numbers = self.program.ruleset_of(worlds).numpy()
+        began = np.zeros(self.num_envs, bool)
+        began[rows] = True
+        for number in sorted({*self._groups, *numbers[rows].tolist()}):
+            env, old = self._groups.get(number, (None, rows[:0]))
+            kept, new = ~began[old], rows[numbers[rows] == number]
+            if kept.all() and not len(new):
+                continue
+            members = np.concatenate([old[kept], new])
+            if not len(members):
+                del self._groups[number]
+                continue
+            env = env or self._env(number, len(members))
+            self._groups[number] = env, members
+            episodes = env.program.start(worlds[new]) if len(new) else None
+            returned = torch.zeros(len(members), dtype=torch.float64)
+            if kept.any():
+                assert env.episodes is not None
+                count = int(kept.sum())
+                places = torch.from_numpy(np.flatnonzero(kept))
+                returned[:count] = env.returns[places]
+                repeated = torch.cat([places, places[:1].expand(len(new))])
+                whole = env.program.select(env.episodes, repeated)
+                if episodes is not None:
+                    episodes = env.program.put(whole, torch.arange(count, len(members)), episodes, reuse=True)
+                else:
+                    episodes = whole
+            assert episodes is not None
+            known = {param.name for param in env.task.ruleset.params}
+            params = {name: value[members] for name, value in self.params.items() if name in known}
+            env.adopt(episodes, returned, params)
+        self._regroup(dict(sorted(self._groups.items())))
+
+    def _regroup(self, groups: dict[int, tuple[CompiledEnv, Array]]) -> None:
+        """Go on with these groups."""
+        self._groups = groups
+        members = np.concatenate([rows for _, rows in groups.values()])
+        self._order = np.argsort(members)
+        self.episodes = episodes = MixedEpisodes([*groups.values()])  # type: ignore[assignment]  # reads like them
+        steppers = [env._ready() for env, _ in groups.values()]
+        space, ready = self.observation.space, [stepper for stepper in steppers if stepper is not None]
+        self._joint = None
+        if len(ready) == len(steppers):
+            self._joint = Joint(ready, members, space.shape, space.dtype)
+        if self.observation.kind == "laws":
+            self._told = episodes.joined(TaskProgram.told).numpy()
+
+    # Stepping
+
+    def step(self, actions: Any) -> tuple[Tensor, Tensor, Tensor, Tensor, Info]:
+        """Act once in every episode: see `TensorEnv.step`."""
+        *parts, info = self.step_arrays(actions)
+        observed, reward, terminated, truncated = map(torch.from_numpy, parts)
+        return observed, reward, terminated, truncated, tensors_of(info)
+
+    def step_arrays(self, actions: Any) -> Steps:
+        """Act once in every episode: `step` with NumPy arrays."""
+        if self.episodes is None:
+            raise ResetNeeded("reset the environment before its first step")
+        checked = self.action_form.decode(actions)
+        if len(checked) != self.num_envs:
+            raise ValueError(f"{len(checked)} actions for {self.num_envs} environments")
+        given, mode = np.asarray(actions), self.autoreset_mode
+        if mode is AutoresetMode.DISABLED:
+            check_going(self._ended)
+        step = self._step_apart if self._joint is None else self._joint.step
+        observed, reward, terminated, truncated, success, returned, length = step(given)
+        if self.observation.kind == "laws":
+            observed[:, 1].reshape(self.num_envs, -1)[:, : self._told.shape[1]] = self._told
+        active = np.ones(self.num_envs, bool)
+        waiting = self._ended
+        if mode is AutoresetMode.NEXT_STEP:
+            active = ~waiting.numpy()
+            reward = np.where(active, reward, 0)
+            terminated, truncated, success = terminated & active, truncated & active, success & active
+        ended = terminated | truncated
+        info: dict[str, Any] = {
+            "success": success,
+            "_success": active,
+            "episode_return": returned * ended,
+            "episode_length": length * ended,
+            "_episode_return": ended,
+            "_episode_length": ended,
+        }
+        self._ended = torch.from_numpy(ended)
+        if mode is AutoresetMode.SAME_STEP:
+            last = {"world": self.episodes.seed.numpy()}
+            last |= {name: info[name] for name in ("success", "episode_return", "episode_length")}
+            info["final_info"] = last | {f"_{name}": ended for name in last}
+            info["final_obs"] = observed[ended]
+            info["_final_obs"] = info["_final_info"] = ended
+            waiting, self._ended = self._ended, torch.zeros_like(self._ended)
+        if mode is not AutoresetMode.DISABLED:
+            self._next_episodes(waiting, observed)
+        info["world"], info["_world"] = self.episodes.seed.numpy(), np.ones(self.num_envs, bool)
+        if self.shows_mask:
+            info["action_mask"] = self.action_masks().to(torch.int8).numpy()
+            info["_action_mask"] = info["_world"]
+        return observed, reward, terminated, truncated, info
+
+    def _step_apart(self, actions: Array) -> list[Array]:
+        """Step environment after environment; the columns of `COLUMNS`, rows in the order of `self`."""
+        parts = []
+        for env, rows in self._groups.values():
+            env._ended.zero_()  # those that wait step too: what comes of it is not shown
+            *first, info = env.step_arrays(actions[rows])
+            parts.append([*first, *(info[name] for name in COLUMNS[4:])])
+        return [np.concatenate(column)[self._order] for column in zip(*parts, strict=True)]
+
+    def _next_episodes(self, mask: Tensor, observed: Array) -> None:
+        """Begin the next episodes where `mask`, bool [B], is set, and write their first observations."""
+        if not bool(mask.any()):
+            return
+        assert self._base is not None
+        self._episode = self._episode + mask
+        self._restart(mask, world_seeds(self._base, self._episode, self.worlds))
+        rows = mask.numpy()
+        for env, members in self._groups.values():
+            if rows[members].any():
+                assert env.episodes is not None
+                places = torch.from_numpy(np.flatnonzero(rows[members]))
+                shown = env.observation.of(env.episodes)
+                observed[members[places]] = shown[places].numpy()
+
+    @property
+    def returns(self) -> Tensor:
+        """The return of each current episode so far: float64 [B]."""
+        return joined(
+            [env.returns for env, _ in self._groups.values()], [rows for _, rows in self._groups.values()]
+        )
+
+    # Saving
+
+    def state(self) -> dict[str, Any]:
+        """Return everything that later steps depend on: see `TensorEnv.state`."""
+        if self.episodes is None or self._base is None:
+            raise ResetNeeded("reset the environment before saving it")
+        return {
+            **{name: getattr(self, f"_{name}").clone() for name in ("base", "episode", "ended")},
+            "params": {name: value.clone() for name, value in self.params.items()},
+            "groups": {
+                number: {"rows": torch.from_numpy(rows), "env": env.state()}
+                for number, (env, rows) in self._groups.items()
+            },
+        }
+
+    def restore(self, state: Mapping[str, Any]) -> Tensor:
+        """Continue from a result of `state`: see `TensorEnv.restore`."""
+        if len(state["base"]) != self.num_envs:
+            raise ValueError(f"{len(state['base'])} worlds were saved: {self.num_envs} are needed")
+        groups: dict[int, tuple[CompiledEnv, Array]] = {}
+        for number, saved in state["groups"].items():
+            rows = saved["rows"].numpy().copy()
+            if not 0 <= number < len(self.program.rulesets):
+                raise ValueError(f"there is no ruleset {number}: there are {len(self.program.rulesets)}")
+            env = CompiledEnv(self.program.under(number), len(rows))
+            env.restore(saved["env"])
+            episodes, returned, params = env.episodes, env.returns, env.params
+            assert episodes is not None
+            groups[number] = self._env(number, len(rows)), rows
+            groups[number][0].adopt(episodes, returned, params)
+        members = np.concatenate([rows for _, rows in groups.values()])
+        if sorted(members.tolist()) != [*range(self.num_envs)]:
+            raise ValueError("the saved worlds are not those of an environment")
+        for name in ("base", "episode", "ended"):
+            setattr(self, f"_{name}", state[name].clone())
+        self.params = {name: value.clone() for name, value in state["params"].items()}
+        self._regroup(groups)
+        assert self.episodes is not None
+        return self.observation.of(self.episodes)

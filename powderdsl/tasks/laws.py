@@ -1,0 +1,72 @@
+"""What can be told of the laws that worlds run under: outcomes of small experiments, and the parameters that worlds draw."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from itertools import permutations
+
+import torch
+from torch import Tensor
+
+from powderdsl.simulation.simulator import Simulator
+from powderdsl.tasks.task import Task
+
+SIDE, BLOCK, STEPS, SAMPLES = 16, 4, 8, 4
+"""An experiment: a square of one element in the middle of a world of another; and in how many worlds it is made."""
+
+NUMBERS = ("down", "right", "inner", "outer")
+"""What an experiment measures: where the square has gone, and how much there is of both elements."""
+
+
+def experiments(simulator: Simulator) -> Tensor:
+    """The outcomes of experiments with every pair of elements, in the order of ids: uint8 [pairs · 4].
+
+    127 or 128 is no change: what went `STEPS` cells down or right has 255; of what has doubled there is 255, too.
+    """
+    pairs = list(permutations(sorted(element.id for element in simulator.ruleset.elements), 2))
+    inner, outer = torch.tensor(pairs).repeat_interleave(SAMPLES, 0).T
+    first = (SIDE - BLOCK) // 2
+    ids = outer[:, None, None].repeat(1, SIDE, SIDE)
+    ids[:, first : first + BLOCK, first : first + BLOCK] = inner[:, None, None]
+    seeds = torch.arange(SAMPLES).repeat(len(pairs))
+    world = simulator.step(simulator.world(ids.to(torch.uint8), seeds), STEPS)
+    after = world.ids.long().cpu()
+    place = torch.arange(SIDE, dtype=torch.float64) - (SIDE - 1) / 2
+    is_inner = (after == inner[:, None, None]).double()
+    count = is_inner.sum((1, 2))
+    moved = [(is_inner.sum(axis) @ place) / count.clamp(min=1) / STEPS for axis in (2, 1)]
+    left = count / BLOCK**2, (after == outer[:, None, None]).double().sum((1, 2)) / (SIDE**2 - BLOCK**2)
+    numbers = torch.stack([*moved, *(share - 1 for share in left)], 1)
+    mean = numbers.view(len(pairs), SAMPLES, len(NUMBERS)).mean(1)
+    return ((mean.clamp(-1, 1) + 1) * 127.5).round().to(torch.uint8).flatten()
+
+
+class Laws:
+    """Describes the laws of a task's worlds in bytes: experiments, where rulesets differ between worlds, then parameters."""
+
+    def __init__(self, task: Task, simulator: Simulator):
+        self._simulator, splits = simulator, task.splits
+        self._experiments = torch.zeros(0, dtype=torch.uint8)
+        elements = simulator.ruleset.elements
+        self._tries = len(elements) * (len(elements) - 1) * len(NUMBERS)
+        self._mixed = any(split.rulesets for split in splits)
+        ranges: dict[str, tuple[float, float]] = {}
+        for part in (part for split in splits for part in split.params):
+            low, high = ranges.get(part.name, (part.low, part.high))
+            ranges[part.name] = min(low, part.low), max(high, part.high)
+        self._ranges = ranges
+
+    def __len__(self) -> int:
+        return self._tries * self._mixed + len(self._ranges)
+
+    def of(self, params: Mapping[str, Tensor], worlds: int) -> Tensor:
+        """The laws of worlds, uint8 [B, n], that run with some parameters, float64 [B] each, and the rules' others."""
+        if self._mixed and not len(self._experiments):
+            self._experiments = experiments(self._simulator)
+        defaults = {param.name: float(param.default) for param in self._simulator.ruleset.params}
+        values = [self._experiments.expand(worlds, -1)]
+        for name, (low, high) in self._ranges.items():
+            value = torch.as_tensor(params.get(name, defaults[name]), dtype=torch.float64).cpu()
+            share = (value.expand(worlds) - low) / max(high - low, 1e-9)
+            values.append((share.clamp(0, 1) * 255).round().to(torch.uint8)[:, None])
+        return torch.cat(values, 1)

@@ -1,0 +1,363 @@
+"""Environments whose worlds draw their laws: parameters from ranges, and rulesets."""
+
+from __future__ import annotations
+
+import random
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from powderdsl.diagnostics import Reporter, Source
+from powderdsl.tasks.file import read_task
+from tests.compilers import skip_without_compiler
+from tests.envs.test_compiled import MODES, assert_alike, assert_same, both, random_actions
+
+pytestmark = pytest.mark.usefixtures("torch")
+
+MELTING = """
+task: melting
+rules: core+water+fire+lava
+params: {water.melt: 1%..40%}
+size: [16, 16]
+fill: empty
+generate:
+  - disk ice at (3..12, 3..12) radius 2..4
+  - disk lava at (3..12, 3..12) radius 2
+agent: {may: any, actions: 7, steps_per_action: 3}
+reward: {each: count(water) / 10}
+splits:
+  test: {params: {water.melt: 50%..90%}}
+  fixed: {params: {water.melt: 5%}}
+"""
+
+PACK = """
+pack: p{number}
+needs: core
+elements:
+  pool: {{id: 2, density: {pool}, gravity: yes, color: "#3355CC", glyph: p, tags: fluid}}
+  grain: {{id: 3, density: 3, gravity: yes, color: "#CC5533", glyph: g, tags: powder}}
+  crust: {{id: 4, density: 5, color: "#555555", glyph: c}}
+params: {{bite: {bite}%}}
+passes:
+  react:
+    after: flow
+    do:
+      - crust -> empty if count({solvent}) > 0 and interact < bite
+"""
+
+MIXED = """
+task: dissolving
+rules: p0.yaml
+rulesets: [p0.yaml, p1.yaml, p2.yaml]
+size: [16, 16]
+fill: empty
+generate:
+  - disk crust at (4..12, 4..12) radius 4
+  - disk (pool, grain) at (3..12, 3..12) radius 2
+agent: {may: any, actions: 6, steps_per_action: 2}
+reward: {each: change(-count(crust)) / 10}
+end: {success: count(crust) < 12}
+expert:
+  - {choose: pool, at: most(crust)}
+splits:
+  test: {rulesets: [p3.yaml]}
+"""
+
+
+@pytest.fixture(scope="module")
+def mixed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A task of three rulesets, and one held out."""
+    folder = tmp_path_factory.mktemp("mixed")
+    for number, (pool, bite, solvent) in enumerate(
+        [(2, 90, "pool"), (4, 30, "grain"), (2, 20, "grain"), (4, 60, "pool")]
+    ):
+        text = PACK.format(number=number, pool=pool, bite=bite, solvent=solvent)
+        (folder / f"p{number}.yaml").write_text(text, encoding="utf-8")
+        alone = MIXED.replace("rules: p0", f"rules: p{number}").replace(
+            "rulesets: [p0.yaml, p1.yaml, p2.yaml]\n", ""
+        )
+        (folder / f"alone{number}.yaml").write_text(alone, encoding="utf-8")
+    (folder / "mixed.yaml").write_text(MIXED, encoding="utf-8")
+    return folder
+
+
+def task_of(text: str) -> Any:
+    return read_task(Source("test.yaml", text), Reporter())
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_drawn_parameters_are_the_same_in_one_call(mode: str) -> None:
+    plain, compiled = both(task_of(MELTING), 9, autoreset_mode=mode, observation="laws")
+    assert_alike(plain, compiled, 20, seed=4)
+    drawn = compiled.episodes.params["water.melt"]
+    assert len(drawn.unique()) > 4
+    assert 0.01 <= float(drawn.min()) < float(drawn.max()) <= 0.4
+    assert_same(
+        plain.reset(options={"params": {"water.melt": 0.7}}),
+        compiled.reset(options={"params": {"water.melt": 0.7}}),
+        "given parameters",
+    )
+    draws = random.Random(1)
+    for number in range(10):
+        actions = random_actions(plain, draws)
+        assert_same(plain.step(actions), compiled.step(actions), f"step {number}")
+        if mode == "disabled" and number == 5:
+            break
+
+
+def test_parameters_from_outside_win_and_can_be_taken_back() -> None:
+    import torch
+
+    from powderdsl.tasks.episodes import params_of
+
+    env, _ = both(task_of(MELTING), 4, autoreset_mode="disabled")
+    env.reset(seed=3)
+    drawn = env.episodes.params["water.melt"].clone()
+    given = float(torch.tensor(0.7))
+    env.reset(seed=3, options={"params": {"water.melt": 0.7}})
+    assert params_of(env.episodes, env.params)["water.melt"].tolist() == [given] * 4
+    half = torch.tensor([True, True, False, False])
+    env.reset(options={"params": {}, "reset_mask": half, "worlds": [3, 4, 3, 4]})
+    assert params_of(env.episodes, env.params)["water.melt"].tolist() == [*drawn[:2].tolist(), given, given]
+
+
+def test_each_world_draws_by_its_number_within_the_range_of_its_split() -> None:
+    import torch
+
+    from powderdsl.tasks.episodes import compile_task
+    from powderdsl.tasks.shipped import load_task
+
+    task = task_of(MELTING)
+    worlds = torch.arange(200)
+    values = {}
+    for split, low, high in (("train", 0.01, 0.4), ("test", 0.5, 0.9), ("fixed", 0.05, 0.05)):
+        program = compile_task(task, split=split, backend="wasm")
+        values[split] = program.start(worlds).params["water.melt"]
+        assert (values[split] >= low - 1e-6).all()
+        assert (values[split] <= high + 1e-6).all()
+        assert torch.equal(program.start(worlds[7:9]).params["water.melt"], values[split][7:9])
+    third = (values["train"] < 0.14).double().mean()
+    assert 0.2 < float(third) < 0.5, "uniform"
+    assert load_task("sand-pushing").split("train").params == ()
+
+
+def test_a_parameter_that_is_set_is_not_drawn() -> None:
+    task = read_task(Source("test.yaml", MELTING), Reporter(), params={"water.melt": 0.25})
+    assert [split.params for split in task.splits] == [()] * 3
+    assert {param.name: param.default for param in task.ruleset.params}["water.melt"] == 0.25
+
+
+def alone(folder: Path, worlds: int, backend: str, **how: Any) -> list[list[Any]]:
+    """Environments of one world for each of some worlds, one for each ruleset."""
+    from powderdsl.envs.tensor_env import TensorEnv
+    from powderdsl.tasks.episodes import compile_task
+
+    programs = [compile_task(str(folder / f"alone{number}.yaml"), backend=backend) for number in range(3)]
+    return [
+        [TensorEnv(program, 1, autoreset_mode="disabled", **how) for program in programs]
+        for _ in range(worlds)
+    ]
+
+
+@pytest.mark.parametrize("backend", ["wasm", "native"])
+@pytest.mark.parametrize("mode", MODES)
+def test_worlds_under_different_rules_do_what_they_do_alone(mixed: Path, backend: str, mode: str) -> None:
+    import torch
+
+    from powderdsl.envs.mixed import environment
+    from powderdsl.envs.tensor_env import world_seeds
+
+    if backend == "native":
+        skip_without_compiler()
+    count, pool = 7, 40
+    how: dict[str, Any] = {"autoreset_mode": mode, "backend": backend, "worlds": pool}
+    env = environment(mixed / "mixed.yaml", count, **how)
+    players = alone(mixed, count, backend)
+    base, episode = 5 + torch.arange(count), torch.zeros(count, dtype=torch.int64)
+    current: list[Any] = [None] * count
+
+    def begin(row: int) -> Any:
+        world = int(world_seeds(base[row : row + 1], episode[row : row + 1], pool))
+        current[row] = players[row][world % 3]
+        observed, _ = current[row].reset(seed=0, options={"worlds": world})
+        return observed[0]
+
+    observed, _ = env.reset(seed=5)
+    assert torch.equal(observed, torch.stack([begin(row) for row in range(count)]))
+    draws, waiting, ends = random.Random(2), [False] * count, 0
+    for number in range(22):
+        actions = random_actions(env, draws)
+        observed, *flags, info = env.step(actions)
+        finals = iter(info.get("final_obs", ()))
+        for row in range(count):
+            if waiting[row]:
+                episode[row] += 1
+                waiting[row] = False
+                assert torch.equal(observed[row], begin(row))
+                assert [float(flag[row]) for flag in flags] == [0, 0, 0]
+                continue
+            expected, *rest, told = current[row].step(actions[row : row + 1])
+            assert [flag[row] for flag in flags] == [flag[0] for flag in rest]
+            for name in ("success", "episode_return", "episode_length"):
+                assert info[name][row] == told[name][0]
+            if not bool(rest[1] | rest[2]):
+                assert torch.equal(observed[row], expected[0])
+                continue
+            ends += 1
+            if mode == "same_step":
+                assert torch.equal(next(finals), expected[0])
+                episode[row] += 1
+                assert torch.equal(observed[row], begin(row))
+            else:
+                assert torch.equal(observed[row], expected[0])
+                waiting[row] = True
+        if mode == "disabled" and any(waiting):
+            mask = torch.tensor(waiting)
+            observed, _ = env.reset(options={"reset_mask": mask})
+            for row in mask.nonzero()[:, 0].tolist():
+                episode[row] += 1
+                assert torch.equal(observed[row], begin(row))
+            waiting = [False] * count
+        if number == 9:
+            continued = environment(mixed / "mixed.yaml", count, **how)
+            assert torch.equal(continued.restore(env.state()), env.observation.of(env.episodes))
+            env = continued
+    assert ends > count
+
+
+def test_faces_show_worlds_under_different_rules(mixed: Path) -> None:
+    import gymnasium.utils.env_checker
+    import numpy as np
+
+    from powderdsl.envs.gym import PowderEnv, PowderVectorEnv
+
+    env = PowderVectorEnv(mixed / "mixed.yaml", 5, backend="wasm", render_mode="rgb_array")
+    env.reset(seed=1)
+    assert env.render() is not None
+    for _ in range(14):
+        observed, reward, *_ = env.step(env.action_space.sample())
+    assert observed.shape == (5, 1, 16, 16)
+    assert reward.dtype == np.float32
+    gymnasium.utils.env_checker.check_env(
+        PowderEnv(mixed / "mixed.yaml", backend="wasm"), skip_render_check=True
+    )
+
+
+def test_laws_tell_rulesets_apart(mixed: Path) -> None:
+    import torch
+
+    from powderdsl.envs.mixed import environment
+
+    env = environment(mixed / "mixed.yaml", 6, backend="wasm", observation="laws", autoreset_mode="same_step")
+    observed, info = env.reset(seed=0)
+    told = observed[:, 1].flatten(1)
+    rulesets = info["world"] % 3
+    for first in range(6):
+        for second in range(6):
+            assert torch.equal(told[first], told[second]) == bool(rulesets[first] == rulesets[second])
+    before = told.clone()
+    for _ in range(6):
+        observed, _, _, truncated, info = env.step(random_actions(env, random.Random(0)))
+    assert truncated.any()
+    assert torch.equal(info["final_obs"][:, 1].flatten(1), before[info["_final_obs"]])
+    count = len(env.program.laws)
+    assert count == 5 * 4 * 4
+    assert (observed[:, 1].flatten(1)[:, count:] == 0).all()
+
+
+def test_plain_environments_refuse_several_rulesets(mixed: Path) -> None:
+    from powderdsl.envs.tensor_env import TensorEnv
+
+    with pytest.raises(ValueError, match=r"different rulesets: use powderdsl\.envs\.environment"):
+        TensorEnv(mixed / "mixed.yaml")
+
+
+def test_laws_that_are_the_same_everywhere_are_refused() -> None:
+    from powderdsl.envs.tensor_env import TensorEnv
+
+    with pytest.raises(ValueError, match="the laws of sand-pushing are the same in all worlds"):
+        TensorEnv("sand-pushing", observation="laws")
+
+
+def test_evaluations_and_recordings_follow_the_rulesets(mixed: Path, tmp_path: Path) -> None:
+    from powderdsl.datasets import Dataset, record
+    from powderdsl.rl.evaluation import evaluate
+    from powderdsl.tasks.shipped import load_task
+
+    task = load_task(mixed / "mixed.yaml")
+    whole = evaluate(task, splits=["train"], policies=["expert", "nothing"], episodes=6, backend="wasm")
+    returns = {score.policy: score.mean for score in whole.scores}
+    singles = [
+        evaluate(
+            load_task(mixed / f"alone{number}.yaml"),
+            splits=["train"],
+            policies=["expert"],
+            episodes=6,
+            backend="wasm",
+        )
+        for number in range(3)
+    ]
+    assert returns["expert"] > returns["nothing"]
+    assert min(alone.scores[0].mean for alone in singles) <= returns["expert"]
+    record(mixed / "mixed.yaml", "expert", tmp_path / "data", episodes=6, backend="wasm")
+    data = Dataset.open(tmp_path / "data")
+    recorded = [float(data.episode(number).reward.sum()) for number in range(6)]
+    assert sum(recorded) / 6 == pytest.approx(returns["expert"], abs=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("change", "code", "text"),
+    [
+        ("melt: 1%..40%", "PD807", "the split `test` draws values of `water.melt` that `train` draws too"),
+        ("melt: 1%..200%", "PD402", "the parameter `water.melt` cannot be `1%..200%`"),
+        ("melt: 40%..1%", "PD402", "the parameter `water.melt` cannot be `40%..1%`"),
+        ("melt: ..5%", "PD402", "the parameter `water.melt` cannot be `..5%`"),
+        ("molt: 1%..4%", "PD802", "unknown parameter `water.molt`"),
+    ],
+)
+def test_wrong_ranges_are_reported(change: str, code: str, text: str) -> None:
+    from powderdsl.diagnostics import CompileError
+
+    reporter = Reporter()
+    wrong = MELTING.replace("50%..90%", "30%..90%") if code == "PD807" else MELTING
+    try:
+        read_task(Source("test.yaml", wrong.replace("melt: 1%..40%", change, 1)), reporter)
+    except CompileError:
+        assert code != "PD807"
+    assert [(diagnostic.code, diagnostic.message) for diagnostic in reporter.diagnostics][:1] == [
+        (code, text)
+    ]
+
+
+def test_wrong_rulesets_are_reported(mixed: Path) -> None:
+    from powderdsl.diagnostics import CompileError
+    from powderdsl.tasks.shipped import load_task_with_diagnostics
+
+    def codes(change: str) -> list[str]:
+        place = mixed / "changed.yaml"
+        place.write_text(MIXED.replace("[p3.yaml]", change), encoding="utf-8")
+        try:
+            _, diagnostics = load_task_with_diagnostics(place)
+        except CompileError as error:
+            diagnostics = error.diagnostics
+        return [diagnostic.code for diagnostic in diagnostics]
+
+    assert codes("[p3.yaml]") == []
+    assert codes("[p1.yaml, p3.yaml]") == ["PD807"]
+    assert codes("[../p3.yaml]") == ["PD112"]
+    assert codes("[nothing]") == ["PD304"]
+    assert codes("[p9..1.yaml]") == ["PD801"]
+    assert codes("[p0..99999999.yaml]") == ["PD801"]
+
+
+def test_the_small_network_reads_laws(mixed: Path, tmp_path: Path) -> None:
+    from powderdsl.rl import preset, train
+    from powderdsl.rl.evaluation import evaluate
+
+    how = {"observation": "laws", "steps": 128, "envs": 4, "rollout": 16, "backend": "wasm", "init_expert": 6}
+    run = train(preset("small", str(mixed / "mixed.yaml"), **how), tmp_path / "run")
+    scores = evaluate(run, splits=["train", "test"], policies=["trained"], episodes=4).scores
+    assert [score.split for score in scores] == ["train", "test"]
+    again = train(preset("small", str(mixed / "mixed.yaml"), **how | {"steps": 192}), tmp_path / "run")
+    assert again.latest_checkpoint().step == 192
