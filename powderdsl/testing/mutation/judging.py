@@ -201,16 +201,13 @@ def judge(original: Original, mutant: Mutant, seed: int = 0) -> Verdict:
     distinction = comparison.distinction  # without one, what runs many worlds notices nothing either
     if (distinction or meaning[1] != original.meaning[1]) and (broken := broken_invariant(original, sim)):
         return Verdict("killed", "invariant", broken.text)
-    if comparison.status == "equal":
-        return Verdict("equivalent", "a proof")
     if distinction is None:
-        return Verdict("survived")
+        return Verdict("equivalent", "a proof") if comparison.status == "equal" else Verdict("survived")
     if failed := failed_test(original, sim, mutant.pack, quick=False):
         return failed
     usual = {param.name: float(param.default) for param in original.ruleset.params}
     sets = any(usual[name] != value for name, (value,) in distinction.sample.params.items())
-    # A test needs a seed, and sets no parameter.
-    shown = not (distinction.draws or sets)
+    shown = not (distinction.draws or sets)  # a test needs a seed, and sets no parameter
     test = written_test(mutant, distinction, original.sim, original.packs) if shown else None
     return Verdict("survived", differs_in=distinction.slot, test=test)
 

@@ -178,8 +178,7 @@ def distinguish(
     Worlds of a model are tried first. Half of the others are made of elements `focus`, ids that are likely to matter.
     Equal seeds give the same worlds. `names`: as for `compare`.
     """
-    known = {slot.name for slot in second.slots}
-    slots = tuple(slot.name for slot in first.slots if slot.name in known)
+    slots = tuple(slot.name for slot in first.slots if slot.name in {other.name for other in second.slots})
     sides = (first, Names()), (second, names or Names())
     streams = [replace(s, name=words.stream(s.name)) for sim, words in sides for s in sim.ruleset.streams]
 
@@ -196,27 +195,31 @@ def distinguish(
 
     batches = [] if model is None else starts(model, replace(first.ruleset, streams=tuple(streams)))
     shown = [(some, sample, n) for sample, draws, steps in batches for some, n in (({}, steps), (draws, 1))]
-    for compared in (slots[:1], slots):  # the worlds' elements show more than their fields
-        for draws, sample, steps in chain(shown, _samples(first, second, focus, seed)):
-            steps_until = when(draws, sample, steps)
-            if not steps_until.any():
-                continue
-            soonest = int(np.where(steps_until > 0, steps_until, steps + 1).argmin())
-            small, steps = sample.one(soonest), int(steps_until[soonest])
-            draws = {name: values[soonest : soonest + 1] for name, values in draws.items()}
-            if draws:  # a seed that draws so, among worlds of a million cells
-                many = small.repeated(max((1 << 20) // small.ids.size, 1))
-                many = replace(many, seed=np.arange(len(many), dtype=np.int64))
-                lucky = when({}, many, 1)
-                small, draws = (many.one(int(lucky.argmax())), {}) if lucky.any() else (small, draws)
-            if not draws:
-                tries, work = SEEDS if streams else 1, Work(first.ruleset, 1_000_000_000)
-                small, steps = shrink_while(partial(when, {}), small, steps, tries, work)
-            if not streams:
-                small = replace(small, seed=np.zeros_like(small.seed))
-            mine, theirs = (ran[-1] for ran in states(draws, small, steps))
-            slot = next(name for name in compared if (mine[name] != theirs[name]).any())
-            return Distinction(small, steps, slot, mine, theirs, draws)
+    found: list[tuple[tuple[str, ...], Draws, Start, int, Array]] = []
+    for draws, sample, steps in chain(shown, _samples(first, second, focus, seed)):
+        mine, theirs = states(draws, sample, steps)
+        for compared in (slots, slots[:1]):
+            if (steps_until := first_difference(mine, theirs, compared)).any():
+                found.append((compared, draws, sample, steps, steps_until))
+        if found and found[-1][0] == slots[:1]:
+            break  # they show more than fields
+    for compared, draws, sample, steps, steps_until in sorted(found, key=lambda some: len(some[0]))[:1]:
+        soonest = int(np.where(steps_until > 0, steps_until, steps + 1).argmin())
+        small, steps = sample.one(soonest), int(steps_until[soonest])
+        draws = {name: values[soonest : soonest + 1] for name, values in draws.items()}
+        if draws:  # a seed that draws so, among worlds of a million cells
+            many = small.repeated(max((1 << 20) // small.ids.size, 1))
+            many = replace(many, seed=np.arange(len(many), dtype=np.int64))
+            lucky = when({}, many, 1)
+            small, draws = (many.one(int(lucky.argmax())), {}) if lucky.any() else (small, draws)
+        if not draws:
+            tries, work = SEEDS if streams else 1, Work(first.ruleset, 1_000_000_000)
+            small, steps = shrink_while(partial(when, {}), small, steps, tries, work)
+        if not streams:
+            small = replace(small, seed=np.zeros_like(small.seed))
+        one, other = (ran[-1] for ran in states(draws, small, steps))
+        slot = next(name for name in compared if (one[name] != other[name]).any())
+        return Distinction(small, steps, slot, one, other, draws)
     return None
 
 
