@@ -31,6 +31,7 @@ GROUPS = {
         "prove": "Prove that two rulesets do the same, or that a claim always holds.",
         "trace": "Explain a cell: which rule wrote it, and what the rule read.",
         "show": "List elements, reactions, passes and parameters, or describe a task.",
+        "universe": "Print the rule pack of a seed: invented elements and laws.",
         "explain": "Explain a diagnostic code and how to fix it.",
         "compile": "Print the output of a compiler stage.",
         "bench": "Measure how fast rules run, on each backend, batch and size.",

@@ -38,6 +38,7 @@ from powderdsl.system.writing import replacing
 from powderdsl.targets.array_kind import ArrayKind
 from powderdsl.tasks.shipped import load_task, shipped_tasks
 from powderdsl.tasks.tensors.generator import StartWorlds
+from powderdsl.universes import is_universe
 from powderdsl.worlds.raster import Size, mask
 from powderdsl.worlds.scene import draw_start, shipped_scenes
 from powderdsl.worlds.store import world_data
@@ -105,7 +106,9 @@ class Entry:
         if ruleset is not None:
             rulesets = [base for top in (ruleset, *ruleset.beside) for base in top.lineage]
             sources = [*(base.source for base in rulesets), *sources]
-        return {Path(source.name).name: source.text for source in sources}
+        names = [Path(source.name).name for source in sources]
+        names = [f"{name.replace(':', '_')}.yaml" if is_universe(name) else name for name in names]
+        return {name: source.text for name, source in zip(names, sources, strict=True)}
 
     @property
     def is_shipped(self) -> bool:

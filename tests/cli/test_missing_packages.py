@@ -76,6 +76,7 @@ QUICK = [
     ("export life --out l.wasm", WORKS, WORKS),
     ("export --env sand-pushing --out e.h", "torch", "numpy"),
     ("explain PD612", WORKS, WORKS),
+    ("universe 7", WORKS, WORKS),
 ]
 SLOW = [
     ("check sand-pushing", WORKS, WORKS),

@@ -77,6 +77,11 @@ def test_shipped_rulesets(name: str) -> None:
     compare_shipped(load(name), BACKENDS, SIZES)
 
 
+@pytest.mark.parametrize("seed", tiered(range(5), [3]))
+def test_universes(seed: int) -> None:
+    compare_shipped(load(f"universe:{seed}"), BACKENDS, SIZES[:3])
+
+
 @pytest.mark.parametrize(
     "name", tiered(sorted(set(shipped_tests()) - shipped_variants()), ["life", "powderworld"])
 )

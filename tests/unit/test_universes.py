@@ -23,7 +23,7 @@ ROLES = (
     "fume",
 )  # fmt: skip
 """The tags of one element each, in the order of ids, which begin with 2."""
-GOLDEN = {0: "4a6b1a1fc33af587", 7: "52967b677e200bfa", MAX_SEED: "6c76708ad0f9b622"}
+GOLDEN = {0: "241f384f1a878fcf", 7: "41cbb75b8f633bdf", MAX_SEED: "6c76708ad0f9b622"}
 """Hashes of texts. They change with `rules/universes/laws.yaml`: whatever has been measured on universes is void then."""
 WALL, GRAINS, POOL, CARGO, CRUST, REAGENTS = 1, (2, 3), 4, 5, 6, (7, 8, 9)
 SEEDS = [pytest.param(seed, marks=pytest.mark.slow if seed > 2 else ()) for seed in (*range(39), MAX_SEED)]

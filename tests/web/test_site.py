@@ -18,6 +18,7 @@ import pytest
 
 from powderdsl.simulation.standalone import standalone_module
 from powderdsl.web import site as site_module
+from powderdsl.web.bridge import NAME
 from powderdsl.web.site import PAGE, Entry, Site, SiteServer
 from tests.cli.commands import powderdsl as command
 
@@ -130,3 +131,9 @@ def test_without_its_parts_the_command_says_what_to_do(
     done = command("play", "--no-open", exits=2)
     assert "make web" in done.stderr
     assert "Traceback" not in done.stderr
+
+
+def test_universes_are_files_that_the_page_can_edit() -> None:
+    files = Entry("core-universe-7", ("universe:7",)).files()
+    assert list(files) == ["core.yaml", "universe_7.yaml"]
+    assert all(NAME.fullmatch(name) for name in files)

@@ -84,7 +84,7 @@ def _compared(first: str, second: str, seconds: int) -> tuple[str, list[str], di
 def _side(text: str) -> tuple[str, Ruleset]:
     """The RULES that a side names, and their model, of one pass if it names one."""
     rules, colon, word = text.rpartition(":")
-    if not colon or Path(text).exists() or not re.fullmatch(r"\w+", word):
+    if not colon or Path(text).exists() or not re.fullmatch(r"[^\W\d]\w*", word):
         return text, load(text)
     ruleset = load(rules)
     passes = tuple(pass_ for pass_ in ruleset.passes if pass_.name == word)
