@@ -122,6 +122,7 @@ def judged_again(before: Counts, counts: Counts) -> Counts:
 def main(arguments: list[str]) -> int:
     """Judge, write the counts after each pack, write the table."""
     os.environ.setdefault("OMP_NUM_THREADS", "1")  # one thread a process; they inherit it
+    os.environ["XDG_CACHE_HOME"] = os.devnull  # nobody compiles a mutant again
     jobs = os.cpu_count() or 1
     if "--jobs" in arguments:
         place = arguments.index("--jobs")
