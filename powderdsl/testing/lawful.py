@@ -22,23 +22,30 @@ MOST = 0.5
 
 @dataclass(frozen=True)
 class Findings:
-    """What was found out about a universe."""
+    """What was found out about a universe: diagnostics, claims that are proven or not, and what some worlds did.
+
+    `moved` cells change in the first step, and `reacted` hold another element in the end than moving explains. The element
+    that gained most is `largest`, with its share of all cells.
+    """
 
     remarks: tuple[str, ...]
-    """Diagnostics of its rules."""
     proven: int
     unproven: tuple[str, ...]
-    """Claims that were proven without running a world, and the others."""
     moved: int
-    """Cells whose content changed places in the first step."""
     reacted: int
-    """Cells that held another element in the end, beyond what moving explains."""
     largest: tuple[str, float]
-    """The element that had most cells in the end, apart from the ground, and its share."""
+
+    @property
+    def faults(self) -> list[str]:
+        """The filters that the universe does not pass, in words."""
+        name, share = self.largest
+        faults = [*self.remarks, *(f"not proven: {claim}" for claim in self.unproven)]
+        faults += ["nothing moves"] * (not self.moved) + ["nothing reacts"] * (not self.reacted)
+        return faults + [f"{name} takes over {share:.0%} of the world"] * (share > MOST)
 
     @property
     def lines(self) -> list[str]:
-        """What was found, in words, a finding a line."""
+        """All of it in words, a finding a line."""
         name, share = self.largest
         return [
             f"{len(self.remarks) or 'no'} remarks, {self.proven} claims proven",
@@ -48,46 +55,28 @@ class Findings:
             *(f"fault: {fault}" for fault in self.faults),
         ]
 
-    @property
-    def faults(self) -> tuple[str, ...]:
-        """The filters that the universe does not pass, in words."""
-        name, share = self.largest
-        told = {
-            "nothing moves": not self.moved,
-            "nothing reacts": not self.reacted,
-            f"{name} takes over {share:.0%} of the world": share > MOST,
-        }
-        unproven = (f"not proven: {claim}" for claim in self.unproven)
-        return (*self.remarks, *unproven, *(fault for fault, holds in told.items() if holds))
-
 
 def findings(seed: int) -> Findings:
-    """Check a universe, prove what it claims, and run worlds of random cells under it.
+    """Check a universe, prove what it claims, and run worlds under it of which half of the cells hold the element 0.
 
-    Half of the cells hold the element 0 at the start, the others any. Raises CompileError for rules with mistakes, and as `powderdsl.compile` does where no backend is installed.
+    Raises CompileError for rules with mistakes, and as `powderdsl.compile` does where no backend is installed.
     """
     rules, remarks = load_with_diagnostics(f"universe:{seed}")
     known = ledger(rules)
     own = [claim for claim in rules.invariants if claim.pack == rules.packs[-1]]
-    unproven = [claim for claim in own if prove(claim.claim, rules, known, claim.without) is None]
+    unproven = [claim.span.text for claim in own if prove(claim.claim, rules, known, claim.without) is None]
     sim = compile_rules(rules, backend=starting_backend("cpu"))
     start = sim.world(_start(rules.slots, seed), seed=seed)
     first = sim.step(start)
-    end = sim.step(first, STEPS - 1)
-    before, after, last = (list(chain(*chain(*world.ids.tolist()))) for world in (start, first, end))
-    slots = range(1, rules.slots)
-    counts = [[ids.count(element) for element in slots] for ids in (before, last)]
-    gains = [max(then - now, 0) for now, then in zip(*counts, strict=True)]
-    losses = [max(now - then, 0) for now, then in zip(*counts, strict=True)]
-    most = max(slots, key=lambda element: gains[element - 1])
-    return Findings(
-        tuple(map(render_text, remarks)),
-        len(own) - len(unproven),
-        tuple(claim.span.text for claim in unproven),
-        sum(map(ne, before, after)),
-        max(sum(gains), sum(losses)),
-        (rules.elements[most].name, counts[1][most - 1] / len(before)),
-    )
+    worlds = (start, first, sim.step(first, STEPS - 1))
+    before, after, last = (list(chain(*chain(*world.ids.tolist()))) for world in worlds)
+    gains = {element: last.count(element.id) - before.count(element.id) for element in rules.elements[1:]}
+    reacted = max(sum(gain for gain in gains.values() if gain * sign > 0) * sign for sign in (1, -1))
+    most = max(gains, key=lambda element: gains[element])
+    share = last.count(most.id) / len(last)
+    moved = sum(map(ne, before, after))
+    texts = tuple(map(render_text, remarks))
+    return Findings(texts, len(own) - len(unproven), tuple(unproven), moved, reacted, (most.name, share))
 
 
 def _start(slots: int, seed: int) -> list[list[list[int]]]:

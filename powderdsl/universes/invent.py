@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cache
+from operator import eq, ge, le
 from typing import Any, TypeVar
 
 from powderdsl.diagnostics import Reporter
@@ -30,8 +31,7 @@ def pieces() -> Pieces:
     tree = parse_yaml(source, reporter) if source else None
     reporter.raise_if_errors()
     assert tree is not None
-    found: Pieces = plain(tree)
-    return found
+    return plain(tree)
 
 
 def plain(node: Node) -> Any:
@@ -56,9 +56,8 @@ class Draws:
         low = mix((START_0 + self.seed) & MASK)
         return int(mix((low + self.count * 0x9E3779B1) & MASK)) * limit >> 32
 
-    def pick(self, items: Iterable[T]) -> T:
-        choices = list(items)
-        return choices[self.below(len(choices))]
+    def pick(self, items: Sequence[T]) -> T:
+        return items[self.below(len(items))]
 
     def shuffled(self, items: Iterable[T]) -> list[T]:
         rest = list(items)
@@ -93,8 +92,7 @@ class Universe:
         """Add a law, if there is something to which it applies. `given`: the parts that some letters stand for."""
         chosen = dict(given or {})
         for letter, choice in law.get("draws", {}).items():
-            parts = [part for part in self.candidates(choice, chosen) if part not in chosen.values()]
-            if not parts:
+            if not (parts := [*self.candidates(choice, chosen)]):
                 return
             chosen[letter] = self.draws.pick(parts)
         if name in self.passes:
@@ -110,23 +108,15 @@ class Universe:
             body = words.filled(law["body"], 0).splitlines()
             self.passes[name] = self.block("pass", name=name, about=self.sentences[-1], body=body)
 
-    def candidates(self, choice: str | Sequence[str], chosen: Mapping[str, str]) -> Iterable[str]:
-        """The parts that a letter may stand for: those of a list or a group, or some that are no higher than another letter's,
-        with or without nothing, as high, or no lower."""
-        groups, levels = self.pieces["groups"], {self.pieces["nothing"]: 0, **self.levels}
-        if not isinstance(choice, str):
-            return choice
-        if choice in groups:
-            return list(groups[choice])
-        way, letter = choice.split()
-        level = levels[chosen[letter]]
-        fitting = {
-            "below": (part for part in groups["product"] if levels[part] <= level),
-            "under": (part for part in groups["product"] if levels[part] <= level and part in self.names),
-            "level": (part for part in groups["wild"] if levels[part] == level),
-            "above": (part for part in groups["active"] if levels[part] >= level),
-        }
-        return fitting[way]
+    def candidates(self, choice: str, chosen: Mapping[str, str]) -> Iterable[str]:
+        """The parts of a group, or those that stand below, above or level with the part of a letter."""
+        group, _, letter = choice.partition(" ")
+        parts: list[str] = self.pieces["groups"][group]
+        if letter:
+            levels = {self.pieces["nothing"]: 0, **self.levels}
+            level, fits = levels[chosen[letter]], {"above": ge, "level": eq}.get(group, le)
+            parts = [part for part in parts if fits(levels[part], level)]
+        return (part for part in parts if part not in chosen.values())
 
     def block(self, piece: str, **values: str | list[str]) -> list[str]:
         """The lines of a piece. Lists take the place of the lines that name them alone."""
@@ -170,10 +160,8 @@ class Words:
             chance = f"{draws.within(self.own.get(word) or self.universe.pieces['chances'][word])}%"
             self.universe.params.append(f"{name}: {chance}")
             return name, chance
-        inner = self
-        if letter is not None:
-            inner = Words(self.universe, self.name, self.own, {**self.known, "c": self.known[letter]})
-        rule, said = draws.pick(choices.items())
+        inner = replace(self, known={**self.known, "c": self.known[letter]}) if letter else self
+        rule, said = draws.pick([*choices.items()])
         return inner.filled(rule, 0), inner.filled(said)
 
 
@@ -187,9 +175,8 @@ def _elements(universe: Universe) -> list[str]:
     starts, *others = laws["names"]
     masses: dict[str, int] = {}
     lines: dict[str, str] = {}
-    for (part, row), start, color in zip(
-        parts.items(), draws.shuffled(starts), draws.shuffled(laws["colors"]), strict=False
-    ):
+    looks = zip(draws.shuffled(starts), draws.shuffled(laws["colors"]), strict=False)
+    for (part, row), (start, color) in zip(parts.items(), looks, strict=False):
         kind = laws["kinds"][draws.pick(row["kinds"])]
         name = start + "".join(map(draws.pick, others))
         masses[part] = draws.within(row.get("mass", kind["mass"]), masses)
@@ -218,28 +205,25 @@ def invented(seed: int) -> str:
     laws, draws = pieces(), Draws(seed)
     universe = Universe(draws, laws)
     elements = _elements(universe)
-    for group in laws["always"]:
-        law = draws.pick(group)
+    for law in map(draws.pick, laws["always"]):
         universe.law(law, law["name"])
     for group in laws["free"]:
         for _ in range(draws.within(group["count"])):
             name = draws.pick(group["laws"])
             universe.law(laws["laws"][name], name)
-    tags = {**laws["tags"], **laws["also_tagged"]}
     levels = {part: level for part, level in universe.levels.items() if level}
     sets = {
         ", ".join(universe.names[part] for part, level in levels.items() if level >= least)
         for least in levels.values()
     }
-    invariants = [line for held in sorted(sets, key=len) for line in universe.block("invariant", set=held)]
     lines = universe.block(
         "pack",
         seed=str(seed),
         laws=" ".join(universe.sentences),
         params=sorted(universe.params),
-        tags=[f'{tag}: "{about}"' for tag, about in tags.items()],
+        tags=[f'{tag}: "{about}"' for tag, about in (laws["tags"] | laws["also_tagged"]).items()],
         elements=elements,
         passes=[line for pass_ in universe.passes.values() for line in pass_],
-        invariants=invariants,
+        invariants=[line for held in sorted(sets, key=len) for line in universe.block("invariant", set=held)],
     )
     return "\n".join(lines) + "\n"

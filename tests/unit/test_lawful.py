@@ -14,7 +14,7 @@ from tests.tiers import tiered
 @pytest.mark.parametrize("seed", tiered(range(100, 108), [100]))
 def test_universes_pass_all_filters(seed: int) -> None:
     found = findings(seed)
-    assert found.faults == ()
+    assert found.faults == []
     assert found.proven > 6
     assert found.moved > 100
     assert len(found.lines) == 4
@@ -32,5 +32,5 @@ def test_universes_pass_all_filters(seed: int) -> None:
 )
 def test_each_filter_can_fail(change: dict[str, Any], fault: str) -> None:
     found = replace(findings(100), **change)
-    assert found.faults == (fault,)
+    assert found.faults == [fault]
     assert found.lines[-1] == f"fault: {fault}"

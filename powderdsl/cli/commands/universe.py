@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import click
 
 from powderdsl.cli import options as opt
 from powderdsl.cli.exits import FAILED, OK
-from powderdsl.diagnostics import Reporter
 from powderdsl.system.writing import write_text
-from powderdsl.universes import MAX_SEED, PREFIX, universe_text
+from powderdsl.universes import MAX_SEED, universe_text
 
 
 @click.command("universe")
@@ -34,13 +34,10 @@ def command(seed: int, out: Path | None, about: bool, quick: bool) -> int:
     text = universe_text(seed)
     if out is not None:
         write_text(out, text)
-    elif about:
-        from powderdsl.compiler import read
-
-        packs, _ = read([f"{PREFIX}{seed}"], Reporter())
-        click.echo(packs[-1].about.replace(". ", ".\n"))
     else:
-        click.echo(text, nl=False)
+        click.echo(
+            "\n".join(re.findall('^    about: "(.*)"$', text, re.MULTILINE)) if about else text.rstrip()
+        )
     if quick:
         return OK
     from powderdsl.testing.lawful import findings
