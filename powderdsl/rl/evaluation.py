@@ -287,14 +287,17 @@ def _play_all(
 
 
 def _starts(program: TaskProgram, worlds: Tensor) -> list[bytes]:
-    """Digests of start worlds, elements and fields."""
+    """Digests of start worlds: elements, fields and laws."""
     digests = []
-    if program.is_mixed:  # the same start under two rulesets is two worlds
-        for world, ruleset in zip(worlds[:, None], program.ruleset_of(worlds).tolist(), strict=True):
-            digests += [b"%d %b" % (ruleset, *_starts(program.under(ruleset), world))]
+    if program.is_mixed:
+        for world, number in zip(worlds[:, None], program.ruleset_of(worlds).tolist(), strict=True):
+            rules = "+".join(program.rulesets[number]).encode()
+            digests += [rules + digest for digest in _starts(program.under(number), world)]
         return digests
     for part in worlds.split(BATCH):
-        state = [value.cpu().numpy() for value in program.start(part).world.state.values()]
+        episodes = program.start(part)
+        parts = (*episodes.world.state.values(), *episodes.params.values())
+        state = [value.cpu().numpy() for value in parts]
         digests += [sha256(b"".join(map(bytes, rows))).digest() for rows in zip(*state, strict=True)]
     return digests
 

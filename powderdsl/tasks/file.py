@@ -381,21 +381,23 @@ class _TaskReader:
         """The parameters that worlds draw: those of `train` and of some entries, except what was set from outside."""
         known = {param.name: param for param in self.ruleset.params}
         ranges = dict(train)
-        for name, value in entries:
-            if name.text not in known:
-                report_unknown("parameter", name, known, self.reporter)
+        for word, value in entries:
+            ends_so = [name for name in known if name == word.text or name.endswith(f".{word.text}")]
+            if len(ends_so) != 1:
+                report_unknown("parameter", word, known, self.reporter)
                 continue
-            if name.text in self.origin.params or (entries is self.decl.params and RANGE not in value.text):
+            name = ends_so[0]
+            if name in self.origin.params or (entries is self.decl.params and RANGE not in value.text):
                 continue
-            kind, (low, dots, high) = known[name.text].kind, value.text.partition(RANGE)
+            kind, (low, dots, high) = known[name].kind, value.text.partition(RANGE)
             ends = [param_value(kind, end) for end in (low, high if dots else low)]
             if None in ends or ends[0] > ends[1]:  # type: ignore[operator]  # of two numbers
-                message = f"the parameter `{name.text}` cannot be `{value.text}`"
+                message = f"the parameter `{word.text}` cannot be `{value.text}`"
                 helps = [f"write {describe_kind(kind)}, or a range of two, the smaller first: `LOW..HIGH`"]
                 self.reporter.error("PD402", message, value.span, "not such a value", helps=helps)
                 continue
             first, last = (float(end) for end in ends)  # type: ignore[arg-type]  # None is reported
-            ranges[name.text] = ParamRange(name.text, first, last, kind.name in ("int", "flag"))
+            ranges[name] = ParamRange(name, first, last, kind.name in ("int", "flag"))
         return ranges
 
     def rulesets(self, words: Sequence[Scalar]) -> tuple[tuple[str, ...], ...]:
@@ -426,8 +428,8 @@ class _TaskReader:
             message = f"the split `{decl.name.text}` has {len(common)} rulesets of `train`"
             self.reporter.report("PD807", message, decl.rulesets[0].span, label, helps=helps)
         for name, value in decl.params:
-            usual = train[0].get(name.text)
-            drawn = own[0].get(name.text)
+            ends_so = [other for other in own[0] if other == name.text or other.endswith(f".{name.text}")]
+            usual, drawn = (laws[0].get(ends_so[0]) if ends_so else None for laws in (train, own))
             if usual and drawn and drawn.low <= usual.high and usual.low <= drawn.high:
                 label = f"`train` draws from {usual.low:g}..{usual.high:g}"
                 message = f"the split `{decl.name.text}` draws values of `{name.text}` that `train` draws too"

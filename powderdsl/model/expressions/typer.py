@@ -389,7 +389,13 @@ class Typer:
         for op, table in (("property", symbols.properties), ("field", symbols.fields)):
             if name in table:
                 return Expr(op, table[name].kind, value=name, span=span)
-        return Expr("draw", DRAW, value=name, span=span) if name in symbols.streams else None
+        if name in symbols.streams:
+            return Expr("draw", DRAW, value=name, span=span)
+        # What belongs to no pack, such as a task, may leave out the pack of a parameter that only one has.
+        ends = [qualified for qualified in symbols.params if qualified.endswith(f".{name}")]
+        if scope.pack or len(ends) != 1:
+            return None
+        return Expr("param", symbols.params[ends[0]].kind, value=ends[0], span=span)
 
     def is_new(self, name: Scalar | Syntax, scope: Scope) -> bool:
         """True if a local name is new. Reports a reserved word, and a name that hides another one which its pack knows."""
