@@ -39,6 +39,7 @@ class TrainConfig:
     """Packs, by name or file, that are added to the task's rules."""
     slots: int = setting(0, "Room for this many elements, for packs that come later.", 0, 256)
     worlds: int = setting(1_000_000, "How many worlds there are to draw from.", 1, 2**62)
+    rulesets: int = setting(0, "Only so many rulesets of the split; 0: all.", 0, 1 << 16)
     observation: str = setting("compact", "Observation of the network.", choices=OBSERVATIONS)
     network: str = setting(
         "paper", "The paper's, a small one, or a fully convolutional one.", choices=tuple(USUAL_OBSERVATION)

@@ -221,13 +221,14 @@ def evaluate(
     players = {name: player(name, first, run, deterministic=deterministic) for name in chosen}
     trained = players.get("trained")
     step = trained.step if isinstance(trained, TrainedPolicy) else None
-    own = TaskProgram(task, config.split, first.simulator)
-    training = {*_starts(own, torch.arange(min(TRAINING_STARTS, config.worlds)))}
+    own = TaskProgram(task, config.split, first.simulator, rulesets=config.rulesets)
+    training_worlds = torch.arange(min(TRAINING_STARTS, config.worlds))
+    training = set() if own.is_mixed else {*_starts(own, training_worlds)}
     scores: list[Score] = []
     unchanged: dict[str, int] = {}
     seen: dict[str, Seen] = {}
     for name in names:
-        program = first if name == first.split else TaskProgram(task, name, first.simulator)
+        program = own if name == own.split else TaskProgram(task, name, first.simulator)
         count = config.worlds if run is not None and name == config.split else episodes
         worlds = torch.arange(episodes) % count
         if "expert" in chosen:
@@ -239,6 +240,9 @@ def evaluate(
             returns = torch.stack([play.returns for play in played.values()])
             unchanged[name] = int((returns == returns[0]).all(0).sum())
         if name != config.split:
+            if own.is_mixed:  # only worlds under the rules of both splits can be the same
+                both = torch.tensor([rules in program.rulesets for rules in own.rulesets])
+                training = {*_starts(own, training_worlds[both[own.ruleset_of(training_worlds)]])}
             new = torch.tensor([start not in training for start in _starts(program, worlds)])
             others = played if bool(new.any()) else {}
             without = {name: mean_and_interval(of.returns[new].tolist()) for name, of in others.items()}

@@ -125,6 +125,7 @@ def train(config: TrainConfig, folder: str | Path, *, progress: Progress | None 
             backend=config.backend,
             device=config.device,
             threads=config.threads,
+            rulesets=config.rulesets,
         )
         learner = _Learner(config, program)
         with Metrics(run.path, step) as metrics:

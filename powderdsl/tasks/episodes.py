@@ -65,14 +65,22 @@ class Episodes:
 
 
 class TaskProgram:
-    """A task made executable for one split. Made by `compile_task`.
+    """A task made executable for one split, with the first `rulesets` of its rulesets (0: all). Made by `compile_task`.
 
     Where the worlds of a split run under different rulesets, episodes belong to the programs that `under` gives.
     """
 
-    def __init__(self, task: Task, split: str, simulator: Simulator, *, ruleset: int | None = None):
+    def __init__(
+        self,
+        task: Task,
+        split: str,
+        simulator: Simulator,
+        *,
+        rulesets: int = 0,
+        ruleset: int | None = None,
+    ):
         self.task, self.split, self.simulator = task, split, simulator
-        self.rulesets, self.ruleset = task.split(split).rulesets, ruleset
+        self.rulesets, self.ruleset = task.split(split).rulesets[: rulesets or None], ruleset
         """The rulesets of the split, and the number of the one that this program is under: None if it is under no
         certain one."""
         self._under: dict[int, TaskProgram] = {}
@@ -365,16 +373,17 @@ def compile_task(
     backend: str = "auto",
     device: str | torch.device = "cpu",
     threads: int = 1,
+    rulesets: int = 0,
 ) -> TaskProgram:
-    """A program for one split of a task, or of the task of a name or path.
+    """A program for one split of a task, or of the task of a name or path; under its first `rulesets` only, if not 0.
 
-    Options are those of `powderdsl.compile`. Raises CompileError: PD801 for a split that the task does not have, PD701
+    Other options are those of `powderdsl.compile`. Raises CompileError: PD801 for a split that the task does not have, PD701
     for a backend or device that is not available.
     """
     loaded = task if isinstance(task, Task) else load_task(task)
     check_split(loaded, split)
     simulator = compile_rules(loaded.ruleset, backend, str(device), threads)
-    return TaskProgram(loaded, split, simulator)
+    return TaskProgram(loaded, split, simulator, rulesets=rulesets)
 
 
 def integer_tensor(name: str, values: Any) -> Tensor:

@@ -39,7 +39,7 @@ def both(task: Any, worlds: int, split: str = "train", plain: str = "native", **
     from powderdsl.envs.tensor_env import TensorEnv
     from powderdsl.tasks.episodes import compile_task
 
-    program = compile_task(task, backend="native", split=split)
+    program = compile_task(task, backend="native", split=split).under(0)
     compiled = CompiledEnv(program, worlds, **how)
     if plain == "native":
         return TensorEnv(program, worlds, **how), compiled

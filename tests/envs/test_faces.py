@@ -34,7 +34,7 @@ def test_both_checkers_pass_without_a_warning(name: str) -> None:
 
     Stable-Baselines3 takes 3-D floats for ill-made pictures, so its checker is shown `matrix` flattened.
     """
-    program = compile_task(name, backend="wasm")
+    program = compile_task(name, backend="wasm").under(0)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         for kind, actions in zip(OBSERVATIONS[:4], [*ACTIONS, "discrete"], strict=True):
