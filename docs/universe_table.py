@@ -51,7 +51,7 @@ def of_texts(text: str) -> dict[str, str]:
 def of_pass(pass_: PassGraph) -> Hashable:
     """A lowered pass without constants and names."""
     numbers: dict[Node, int] = {}
-    rows = []
+    rows: list[tuple[object, ...]] = []
     for node in nodes_of(pass_):
         numbers[node] = len(rows)
         attr = None if node.op in DROPPED else node.attr[1] if node.op == "below" else node.attr

@@ -309,14 +309,17 @@ class Ledger:
                 raise KeyError(f"no element `{name}` in {self.name}")
 
 
-def ledger(ruleset: Ruleset) -> Ledger:
-    """The ledger of a checked ruleset, decided from its rules without running a world. Raises TypeError for other values."""
+def ledger(ruleset: Ruleset, *, needs: bool = True) -> Ledger:
+    """The ledger of a checked ruleset, decided from its rules without running a world. Raises TypeError for other values.
+
+    `needs`: also find what rules need in the world, which takes longer than the rest.
+    """
     if not isinstance(ruleset, Ruleset):
         raise TypeError(f"ledger takes a Ruleset, from powderdsl.load; found {type(ruleset).__name__}")
     parts = [replace(facts_of(ruleset), budget=Budget(BUDGET, MAX_QUESTION)) for _ in range(3)]
     names = {element.id: element.name for element in ruleset.elements}
     effects = find_changes(ruleset, parts[0])
-    requirements = find_requirements(ruleset, parts[1])
+    requirements = find_requirements(ruleset, parts[1]) if needs else {}
     return Ledger(
         ruleset.name,
         tuple(names.values()),

@@ -62,7 +62,7 @@ def findings(seed: int) -> Findings:
     Raises CompileError for rules with mistakes, and as `powderdsl.compile` does where no backend is installed.
     """
     rules, remarks = load_with_diagnostics(f"universe:{seed}")
-    known = ledger(rules)
+    known = ledger(rules, needs=False)
     own = [claim for claim in rules.invariants if claim.pack == rules.packs[-1]]
     unproven = [claim.span.text for claim in own if prove(claim.claim, rules, known, claim.without) is None]
     sim = compile_rules(rules, backend=starting_backend("cpu"))

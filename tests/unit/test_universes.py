@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import os
 import re
+import subprocess
+import sys
 from hashlib import sha256
 from itertools import product
 from pathlib import Path
@@ -14,6 +17,7 @@ from powderdsl.analysis.ledger import ledger
 from powderdsl.analysis.proofs import prove
 from powderdsl.compiler import load_with_diagnostics, shipped_words
 from powderdsl.model.types import Ruleset
+from powderdsl.tasks.shipped import load_task
 from powderdsl.universes import MAX_SEED, universe_text
 from powderdsl.universes.invent import Draws, pieces
 from tests.refusals import refusal
@@ -38,6 +42,20 @@ def test_the_text_of_a_seed_is_the_same_everywhere() -> None:
     assert {seed: digest(universe_text(seed)) for seed in GOLDEN} == GOLDEN
 
 
+def test_hashes_of_this_process_do_not_matter() -> None:
+    program = "from powderdsl.universes import universe_text as t; print(hash('') * 0, [*map(t, range(40))])"
+    texts = {
+        subprocess.run(
+            [sys.executable, "-c", program],
+            env={**os.environ, "PYTHONHASHSEED": seed},
+            capture_output=True,
+            check=True,
+        ).stdout
+        for seed in "12"
+    }
+    assert len(texts) == 1
+
+
 @pytest.mark.parametrize("seed", SEEDS)
 def test_a_universe_is_free_of_remarks_and_its_claims_are_proven(seed: int) -> None:
     rules, remarks = load_with_diagnostics(f"universe:{seed}")
@@ -45,7 +63,7 @@ def test_a_universe_is_free_of_remarks_and_its_claims_are_proven(seed: int) -> N
     assert rules.packs[-1] == f"universe_{seed}"
     for number, role in enumerate(ROLES, 2):
         assert [element.id for element in rules.elements if role in element.tags] == [number]
-    known = ledger(rules)
+    known = ledger(rules, needs=False)
     own = [claim for claim in rules.invariants if claim.pack == f"universe_{seed}"]
     assert len(own) > 6
     for claim in own:
@@ -107,6 +125,42 @@ def test_universes_are_named_like_packs() -> None:
     assert powderdsl.load("universe:07").packs == ("core", "universe_7")
     (error,) = refusal(powderdsl.load, "universe:7-acid")
     assert error.message == "`acid` is left out, but it was not there"
+
+
+def test_files_name_universes(tmp_path: Path) -> None:
+    path = tmp_path / "mine.yaml"
+    path.write_text(
+        "ruleset: mine\npacks: [core, universe:7]\nparams: {universe_7.wind: 0}\n", encoding="utf-8"
+    )
+    rules = powderdsl.load(path)
+    assert rules.packs == ("core", "universe_7")
+    assert [param.default for param in rules.params if param.name == "universe_7.wind"] == [0]
+    path.write_text("ruleset: mine\npacks: [core, universe:x]\n", encoding="utf-8")
+    (error,) = refusal(powderdsl.load, path)
+    assert (error.code, error.primary.span and error.primary.span.text) == ("PD304", "universe:x")
+
+
+def test_tasks_name_universes_and_roles(tmp_path: Path) -> None:
+    path = tmp_path / "melt.yaml"
+    path.write_text(TASK, encoding="utf-8")
+    task = load_task(str(path))
+    assert task.agent.choices[:3] == REAGENTS
+    path.write_text(TASK.replace("universe:7", "universe:-7"), encoding="utf-8")
+    assert "universe:7" in refusal(load_task, str(path))[0].helps[0]
+
+
+TASK = """
+task: melt
+rules: universe:7
+size: [16, 16]
+fill: empty
+generate:
+  - box crust rows 8:12 columns 4:12
+  - frame wall
+agent: {may: [reagent_a, reagent_b, reagent_c, nothing], brush: 2, actions: 4}
+reward: {each: -change(count(crust))}
+end: {success: count(crust) == 0}
+"""
 
 
 def test_needs_of_a_universe_are_shipped_packs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
