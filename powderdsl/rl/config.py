@@ -127,7 +127,7 @@ PRESETS: Mapping[str, Mapping[str, Any]] = MappingProxyType(
             "observation": "ids",
             "features": 128,
             "rollout": 128,
-            "epochs": 4,
+            "epochs": 2,
             "learning_rate": 1e-3,
             "entropy": 0.01,
             "steps": 200_000,

@@ -152,6 +152,18 @@ def test_all_mistakes_are_named() -> None:
     assert len(errors) == 7
 
 
+def test_presets_are_those_of_the_documentation() -> None:
+    page = (Path(__file__).parents[2] / "docs" / "training.md").read_text(encoding="utf-8")
+    presets = [preset(name, "dig") for name in ("paper", "small", "fcn")]
+    for label, names in {
+        "learning rate, batch, epochs": ("learning_rate", "batch", "epochs"),
+        "actions in each between updates": ("rollout",),
+        "entropy coefficient": ("entropy",),
+    }.items():
+        cells = [", ".join(f"{getattr(config, name):g}" for name in names) for config in presets]
+        assert f"| {label} | {' | '.join(cells)} |" in page
+
+
 def test_settings_survive_json() -> None:
     config = preset("small", "dig", knobs={"size": 3}, params={"wind.x": "5%"}, network="paper")
     assert config.observation == "compact"
