@@ -15,7 +15,8 @@ from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
 
 from powderdsl.envs.actions import FrameStack, Policy, random_policy
-from powderdsl.envs.tensor_env import TensorEnv, observation_of
+from powderdsl.envs.mixed import environment
+from powderdsl.envs.tensor_env import observation_of
 from powderdsl.experiments.runs import Estimate, RunFolder, find_run, mean_and_interval, write_json
 from powderdsl.rl.config import BASELINES, TrainConfig, chosen_policies
 from powderdsl.rl.policies import TrainedPolicy, config_of, load_policy, task_of
@@ -272,7 +273,7 @@ def player(
     `run`: whose policy the trained one is. `deterministic`: it takes the likeliest action.
     """
     if name == "trained" and run is not None:
-        env = TensorEnv(program.under(0), 1, observation=config_of(run).observation)
+        env = environment(program, 1, observation=config_of(run).observation)
         return load_policy(run, env, deterministic=deterministic)
     if name == "expert":
         return ExpertPlayer(program)
