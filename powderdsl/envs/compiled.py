@@ -40,6 +40,8 @@ class CompiledEnv(TensorEnv):
         if self.episodes is self._bound[0] and self.params is self._bound[1]:
             return self._stepper
         self._bound = None, None
+        if self.curriculum is not None:  # start worlds made ahead would be chosen too early
+            return None
         native = self.simulator.native(self.task.size[1])
         if native is None or self.episodes is None:
             return None

@@ -13,7 +13,7 @@ from gymnasium.vector import AutoresetMode
 from torch import Tensor
 
 from powderdsl.envs.compiled import CompiledEnv, Steps, tensors_of
-from powderdsl.envs.tensor_env import Info, TensorEnv, check_going, world_seeds
+from powderdsl.envs.tensor_env import Info, TensorEnv, check_going
 from powderdsl.tasks.compiled import Recycled, Results, Stepper
 from powderdsl.tasks.episodes import TaskProgram, load_program
 from powderdsl.tasks.mixed import MixedEpisodes, joined
@@ -271,13 +271,15 @@ class MixedEnv(CompiledEnv):
         if not bool(mask.any()):
             return
         assert self._base is not None
-        self._episode = self._episode + mask
-        self._restart(mask, world_seeds(self._base, self._episode, self.worlds))
-        rows = mask.numpy()
+        self._episode, rows = self._episode + mask, mask.nonzero()[:, 0]
+        worlds = torch.zeros_like(self._episode)
+        worlds[rows] = self._choose(self._base[rows], self._episode[rows])
+        self._restart(mask, worlds)
+        begun = mask.numpy()
         for env, members in self._groups.values():
-            if rows[members].any():
+            if begun[members].any():
                 assert env.episodes is not None
-                places = torch.from_numpy(np.flatnonzero(rows[members]))
+                places = torch.from_numpy(np.flatnonzero(begun[members]))
                 shown = env.observation.of(env.episodes)
                 observed[members[places]] = shown[places].numpy()
 

@@ -15,6 +15,7 @@ from gymnasium.vector import AutoresetMode
 from torch import Tensor
 
 from powderdsl.envs.actions import action_form
+from powderdsl.envs.curriculum import Curriculum
 from powderdsl.model.state import property_values
 from powderdsl.simulation.observe import Observer
 from powderdsl.simulation.simulator import MAX_CELLS
@@ -141,6 +142,7 @@ class TensorEnv:
         backend: as in `powderdsl.compile`.
         device: as in `powderdsl.compile`.
         threads: as in `powderdsl.compile`.
+        curriculum: chooses the worlds of later episodes instead.
 
     Attributes:
         num_envs: the number of environments, B.
@@ -174,6 +176,7 @@ class TensorEnv:
         backend: str = "auto",
         device: str | torch.device = "cpu",
         threads: int = 1,
+        curriculum: Curriculum | None = None,
     ):
         check_count("worlds", worlds, MAX_SEED)
         check_count("max_episode_steps", 1 if max_episode_steps is None else max_episode_steps, MAX_SEED)
@@ -188,6 +191,7 @@ class TensorEnv:
         self.num_envs, self.worlds = num_envs, worlds
         self.simulator = self.program.simulator
         self.device = self.simulator.device
+        self.curriculum = curriculum
         self.autoreset_mode = mode_of(autoreset_mode)
         self.observation = observation_of(observation, self.program)
         self.action_form = action_form(actions, self.task.agent, self.device)
@@ -236,7 +240,7 @@ class TensorEnv:
         episode = torch.where(mask, torch.where(seeded, 0, self._episode + 1), self._episode)
         if self._base is not None:
             base = torch.where(mask, base, self._base)
-        worlds = world_seeds(base, episode, self.worlds)
+        worlds = self._choose(base, episode)
         if "worlds" in settings:
             worlds = self.simulator.numbers(settings["worlds"], "worlds", self.num_envs)
         self._base, self._episode, self.params = base, episode, params
@@ -256,6 +260,11 @@ class TensorEnv:
             self.episodes = self.program.start(worlds)
         else:
             self.episodes = self.program.restart(self.episodes, mask, worlds, reuse=True)
+
+    def _choose(self, base: Tensor, episode: Tensor) -> Tensor:
+        """The worlds of environments' episodes, int64 [n]: those of `world_seeds`, unless a curriculum has others."""
+        worlds = world_seeds(base, episode, self.worlds)
+        return worlds if self.curriculum is None else self.curriculum.choose(base, episode, worlds)
 
     def adopt(self, episodes: Episodes, returned: Tensor, params: Mapping[str, Tensor]) -> None:
         """Go on with other episodes, as many as they are, none of which is over.
@@ -426,7 +435,7 @@ class TensorEnv:
             return
         self._episode = self._episode + mask
         self._returned = self._returned.masked_fill(mask, 0)
-        fresh = self.program.start(world_seeds(self._base, self._episode, self.worlds)[places])
+        fresh = self.program.start(self._choose(self._base[places], self._episode[places]))
         self.episodes = self.program.put(self.episodes, places, fresh, reuse=True)
         observed[places] = self.observation.of(fresh)
 

@@ -38,6 +38,11 @@ class TrainConfig:
     packs: tuple[str, ...] = setting(())
     """Packs, by name or file, that are added to the task's rules."""
     slots: int = setting(0, "Room for this many elements, for packs that come later.", 0, 256)
+    curriculum: str = setting(
+        "uniform",
+        "How worlds are drawn: evenly, or where there is more to learn.",
+        choices=("uniform", "prioritized"),
+    )
     worlds: int = setting(1_000_000, "How many worlds there are to draw from.", 1, 2**62)
     rulesets: int = setting(0, "Only so many rulesets of the split; 0: all.", 0, 1 << 16)
     observation: str = setting("compact", "Observation of the network.", choices=OBSERVATIONS)

@@ -19,7 +19,7 @@ from functools import partial
 from itertools import accumulate
 from pathlib import Path
 from statistics import fmean
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import torch
@@ -36,6 +36,7 @@ from torch.distributions import Distribution
 from powderdsl.compiler import whole_palette
 from powderdsl.datasets.dataset import Dataset, Transitions, drawn
 from powderdsl.datasets.recorder import record
+from powderdsl.envs.curriculum import Prioritized
 from powderdsl.envs.features import Patches
 from powderdsl.envs.sb3 import PowderVecEnv
 from powderdsl.envs.tensor_env import channels_of, check_cells
@@ -171,14 +172,34 @@ class _Rollout(RolloutBuffer):
             obs = self.see.count(torch.as_tensor(obs, device=self.device)).cpu().numpy()
         super().add(obs, *rest)
 
+    def scores(self, worlds: Any) -> tuple[torch.Tensor, torch.Tensor]:
+        """The worlds of episodes, int64 [n], and the mean of what was better than expected in each, float64 [n].
+
+        `worlds`: of all observations, int64 [steps, envs].
+        """
+        part = self.episode_starts.cumsum(0).astype(np.int64) + np.arange(self.n_envs) * (
+            self.buffer_size + 1
+        )
+        _, first, episode = np.unique(part, return_index=True, return_inverse=True)
+        gains = np.bincount(episode.ravel(), np.maximum(self.advantages, 0).ravel())
+        return torch.from_numpy(worlds.ravel()[first]), torch.from_numpy(gains / np.bincount(episode.ravel()))
+
 
 class _Learner:
     """The PPO of a run, with its environment: perhaps with stacked observations and normalized rewards."""
 
     def __init__(self, config: TrainConfig, program: TaskProgram):
         self.config = config
+        self.curriculum = Prioritized() if config.curriculum == "prioritized" else None
+        self.shown: list[Any] = []
+        """The worlds of the observations of a rollout, int64 [envs] each, for a curriculum."""
         self.worlds = PowderVecEnv(
-            program, config.envs, observation=config.observation, worlds=config.worlds, actions="full"
+            program,
+            config.envs,
+            observation=config.observation,
+            worlds=config.worlds,
+            actions="full",
+            curriculum=self.curriculum,
         )
         env: VecEnv = self.worlds
         self.stack = self.normal = None
@@ -220,6 +241,12 @@ class _Learner:
             setattr(owner, name, partial(self._timed, part, getattr(owner, name)))
 
     def _timed(self, part: str, method: Callable[..., Any], *arguments: Any) -> Any:
+        if self.curriculum is not None and part == "env":
+            self.shown.append(self.worlds.tensors.episodes.seed.numpy().copy())  # type: ignore[union-attr]  # begun
+        if self.curriculum is not None and part == "update":
+            buffer = cast(_Rollout, self.model.rollout_buffer)
+            self.curriculum.learn(*buffer.scores(np.stack(self.shown)))
+            self.shown = []
         began = time.perf_counter()
         result = method(*arguments)
         self.seconds[part] += time.perf_counter() - began
@@ -246,6 +273,8 @@ class _Learner:
             "steps": self.step,
             "random": _random_state(),
         }
+        if self.curriculum is not None:
+            state["curriculum"] = self.curriculum.state()
         if self.stack is not None:
             state["frames"] = torch.from_numpy(self.stack.stacked_obs.stacked_obs.copy())
         if self.normal is not None:
@@ -257,6 +286,8 @@ class _Learner:
     def restore(self, state: Mapping[str, Any]) -> None:
         model = self.model
         model.policy.load_state_dict(state["policy"])
+        if self.curriculum is not None:
+            self.curriculum.restore(state["curriculum"])
         model.policy.optimizer.load_state_dict(state["optimizer"])
         model._last_obs = self.worlds.restore(state["env"])
         if self.stack is not None:
