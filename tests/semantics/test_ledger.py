@@ -54,6 +54,14 @@ def test_the_ledger_of_powderworld(golden: Callable[[Path, str], None]) -> None:
     golden(GOLDEN / "powderworld.ledger", ledger_text(ledger(load("powderworld"))))
 
 
+def test_what_rules_need_may_be_left_out() -> None:
+    rules = load("core+water+sand+lava")
+    whole, part = ledger(rules), ledger(rules, needs=False)
+    assert any(entry.needs for entry in whole.rules)
+    assert part.rules == tuple(replace(entry, needs=(), copies=()) for entry in whole.rules)
+    assert part.keeps(["sand"], "constant") == whole.keeps(["sand"], "constant")
+
+
 def test_verdicts_name_the_lines_that_stand_in_the_way() -> None:
     book = ledger(load("core+water"))
     assert book.conserved({"water": 1, "ice": 1})
