@@ -1,7 +1,7 @@
 """Lawful universes: rule packs with invented elements and laws, each made of a seed and the pieces in `rules/universes/`.
 
-The same seed gives the same text, on every machine. What is written here is correct by construction: reactions go down in
-rank, so that none of them can go on forever or take over a world, and the pack claims what follows from that.
+The same seed gives the same text, on every machine. What is written here is correct by construction: no reaction goes up in
+rank, so that nothing grows without end, and the pack claims what follows from that.
 """
 
 from __future__ import annotations
@@ -9,10 +9,11 @@ from __future__ import annotations
 import re
 
 from powderdsl.diagnostics import Reporter, Source, Span
-from powderdsl.universes.invent import invented
+from powderdsl.universes.invent import MAX_SEED, universe_text
+
+__all__ = ["MAX_SEED", "PREFIX", "is_universe", "universe_source", "universe_text"]
 
 PREFIX = "universe:"
-MAX_SEED = 0xFFFFFFFF
 
 
 def is_universe(word: str) -> bool:
@@ -20,19 +21,12 @@ def is_universe(word: str) -> bool:
     return word.startswith(PREFIX)
 
 
-def universe_text(seed: int) -> str:
-    """The rule pack of a seed, as YAML. Raises ValueError for a seed outside of 0..2³²-1."""
-    if not 0 <= seed <= MAX_SEED:
-        raise ValueError(f"the seed of a universe must be from 0 to {MAX_SEED:,}, found {seed}")
-    return invented(seed)
-
-
 def universe_source(word: str, span: Span | None, reporter: Reporter) -> Source | None:
     """The pack that a name such as ``universe:7`` means; None after reporting PD304."""
     number = word.removeprefix(PREFIX)
     seed = int(number) if re.fullmatch("[0-9]{1,10}", number) else -1
     if 0 <= seed <= MAX_SEED:
-        return Source(f"{PREFIX}{seed}", invented(seed))
+        return Source(f"{PREFIX}{seed}", universe_text(seed))
     label = f"a number from 0 to {MAX_SEED:,} follows the colon" if span else ""
     helps = [f"write a number from 0 to {MAX_SEED}, as in `{PREFIX}7`"]
     reporter.error("PD304", f"no universe `{number[:80]}`", span, label, helps=helps)

@@ -20,6 +20,7 @@ Pieces = Mapping[str, Any]
 Phrase = tuple[str, str]
 """What rules say, and what people say."""
 
+MAX_SEED = 0xFFFFFFFF
 PLACE = re.compile(r"<(\w+)(?: (\w+))?>")
 RANGE = re.compile(r"(\w+)([+-]\d+)?\.\.(\w+)([+-]\d+)?")
 
@@ -200,8 +201,10 @@ def _elements(universe: Universe) -> list[str]:
     return [lines[tag] for tag in laws["tags"]]
 
 
-def invented(seed: int) -> str:
-    """The rule pack of a seed, as YAML."""
+def universe_text(seed: int) -> str:
+    """The rule pack of a seed, as YAML. Raises ValueError for a seed outside of 0..2³²-1."""
+    if not 0 <= seed <= MAX_SEED:
+        raise ValueError(f"the seed of a universe must be from 0 to {MAX_SEED:,}, found {seed}")
     laws, draws = pieces(), Draws(seed)
     universe = Universe(draws, laws)
     elements = _elements(universe)
