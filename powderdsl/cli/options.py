@@ -219,15 +219,14 @@ device = click.option("--device", default="cpu", help="A torch device: cpu, cuda
 
 SECTIONS = {
     "Run": "run resume preset seed steps iterations episodes envs examples seconds rounds save-every validate-every",
-    "World": "world task split worlds size number rules packs held-out only knob set slots workload reward after data "
-    "ignore-actions",
-    "Drawn rulesets": "rulesets first-ruleset chances swap leave-out",
+    "World": "world task split worlds rulesets size number rules packs held-out only knob set slots workload reward after "
+    "data ignore-actions",
     "Cell": "at step of",
     "Policy": "policy policies deterministic",
     "Network": "network observation features frames width",
     "Cloning": "init-from init-expert init-epochs",
     "Training": "rollout batch epochs learning-rate schedule gamma gae-lambda clip entropy vf-coef max-grad-norm target-kl "
-    "normalize precision buffer refresh",
+    "normalize curriculum precision buffer refresh",
     "Evaluation": "eval-every eval-split eval-episodes",
     "Counterexamples": "replay picture keep",
     "Mutants": "mutate mutants write jobs",

@@ -13,31 +13,12 @@ from powderdsl.system.settings import check_settings, checked_record, setting
 TEST_SEEDS = 1 << 32
 """The first seed of worlds that models are tested on. Training takes seeds below it."""
 
-MAX_RULESETS = 1024
-"""The most rulesets of a run: each is checked before the first step, and each structure compiled."""
-
 
 class Checked:
     """Settings that are checked when they are made."""
 
     def __post_init__(self) -> None:
         check_settings(self)
-
-
-@dataclass(frozen=True)
-class Variety(Checked):
-    """The ways in which random rulesets differ from the ruleset of a run.
-
-    `chances`: parameters that are chances are multiplied by a factor between 1/chances and chances, uniform in its
-    logarithm, up to 1. `swaps`: for each of these properties, two elements exchange their values. `leave_out`: how
-    likely each pack that no other one needs is to be left out.
-    """
-
-    chances: float = setting(1.0, "Factor by which chances of drawn rulesets differ, at most.", 1.0, 1e6)
-    swaps: tuple[str, ...] = setting(
-        (), "Property whose values two elements swap in drawn rulesets.", option="swap"
-    )
-    leave_out: float = setting(0.0, "Probability that a ruleset leaves out a pack.", 0.0, 0.999)
 
 
 @dataclass(frozen=True)
@@ -61,11 +42,7 @@ class DataConfig(Checked):
     )
     steps: int = setting(8, low=1)
     pairs: int = setting(16, low=1)
-    rulesets: int = setting(0, "Number of rulesets to draw around the rules.", 0, MAX_RULESETS)
-    """World s runs under number `first_ruleset` + s mod `rulesets`. 0: all under `rules`."""
-    first_ruleset: int = setting(0, "Number of the first drawn ruleset.", 0, 1 << 32)
-    variety: Variety = field(default_factory=Variety)
-    """The differences between the rulesets."""
+    rulesets: int = setting(0, "Only so many rulesets of the split; 0: all.", 0, 1 << 16)
     capacity: int = setting(1024 * 256, "Capacity of the buffer, in pairs.", 1, 1 << 32, option="buffer")
     refresh: int = setting(256, "Pairs that each iteration replaces in the buffer.", 1, 1 << 20)
 

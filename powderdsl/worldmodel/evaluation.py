@@ -20,7 +20,7 @@ from powderdsl.worldmodel.config import HERE, DataConfig, Machine
 from powderdsl.worldmodel.networks import without_actions
 from powderdsl.worldmodel.scores import Network, Score, elements_of, frequent, outcomes, score, still
 from powderdsl.worldmodel.training import Trained, check_slots, load_rules_of
-from powderdsl.worldmodel.worlds import UNSEEN_RULESETS, Pairs, Recording, TaskWorlds, pairs_of, unseen_seeds
+from powderdsl.worldmodel.worlds import Pairs, Recording, TaskWorlds, pairs_of, unseen_seeds
 
 FIT_WORLDS = 64
 """The most training worlds that baselines are fitted on."""
@@ -173,7 +173,6 @@ def unseen_data(
     rules: str | None = None,
     only: tuple[str, ...] | None = None,
     knobs: Mapping[str, int] | None = None,
-    rulesets: int = 0,
 ) -> DataConfig:
     """Return the worlds to test a network on that was trained on `data`.
 
@@ -181,21 +180,19 @@ def unseen_data(
         task, rules, only, knobs: those of the training data unless others are given; with another task, its own knobs.
         split: by default `designed` if the task has it, or else the split of the training data, whose worlds have other
             seeds here.
-        rulesets: how many rulesets the worlds run under in turn, drawn as those of the training data were, and none of
-            which training takes. 0: the rules as they are.
     """
     knobs = (data.knobs if task is None else {}) if knobs is None else knobs
     splits = [split.name for split in load_task(task or data.task, knobs=knobs).splits]
+    split = split or next(name for name in ("designed", data.split, *splits) if name in splits)
     return replace(
         data,
         task=task or data.task,
-        split=split or next(name for name in ("designed", data.split, *splits) if name in splits),
+        split=split,
         rules=data.rules if rules is None else rules,
         params=data.params if rules is None else {},
         only=data.only if only is None else only,
         knobs=knobs,
-        rulesets=rulesets,
-        first_ruleset=UNSEEN_RULESETS,
+        rulesets=data.rulesets if task is None and split == data.split else 0,
     )
 
 

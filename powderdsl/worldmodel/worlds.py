@@ -1,8 +1,6 @@
 """Worlds to learn from: those of a task without its agent, under other rules, and with fewer elements to draw; and
 transitions recorded from a task, each a state, an action, and the state after it.
 
-Rulesets are drawn from a distribution: other chances, swapped properties, packs left out. A number determines each.
-
 A recorded input is uint8 [B, C + 3, H, W]: the C channels of the observation, and three of what the action does to each
 cell, as `tasks.tensors.actions.Hands` does it: the element that it places (`NO_ELEMENT` for none), and the rows and columns
 of its speed plus 2 (0 where it does not blow). `ActionChannels` makes of it what networks see.
@@ -12,37 +10,29 @@ from __future__ import annotations
 
 import hashlib
 import json
-import math
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
-from itertools import combinations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 import torch
 from torch import Tensor
 
-from powderdsl.compiler import load, read
+from powderdsl.compiler import load
 from powderdsl.datasets.manifest import changed_params, choice_names
 from powderdsl.diagnostics import CompileError, Reporter, Span, suggest
 from powderdsl.experiments.runs import differences
-from powderdsl.model.check import check
 from powderdsl.model.composition.compose import Palette
-from powderdsl.model.composition.names import with_stand_ins
-from powderdsl.model.declarations import ElementDecl, PackDecl
-from powderdsl.model.definitions import set_params
 from powderdsl.model.types import Ruleset
 from powderdsl.simulation.programs import starting_backend
-from powderdsl.simulation.simulator import World
-from powderdsl.system.random import MASK, base_keys, mix
 from powderdsl.system.settings import fingerprint
 from powderdsl.system.writing import failure
-from powderdsl.tasks.episodes import TaskProgram, compile_task
+from powderdsl.tasks.episodes import Episodes, compile_task
 from powderdsl.tasks.shipped import check_split, load_task, shipped_tasks
-from powderdsl.tasks.task import BLOW, NO_CHANGE, NOTHING, Drawing, Generator, Goal, Split, Stamp, Task
+from powderdsl.tasks.task import BLOW, NO_CHANGE, NOTHING, Drawing, Generator, Goal, Stamp, Task
 from powderdsl.tasks.tensors.actions import cells_of
-from powderdsl.worldmodel.config import TEST_SEEDS, DataConfig, Recorded, TrainConfig, Variety
+from powderdsl.worldmodel.config import TEST_SEEDS, DataConfig, Recorded, TrainConfig
 from powderdsl.worldmodel.networks import NO_ELEMENT
 
 if TYPE_CHECKING:
@@ -74,34 +64,25 @@ class Worlds(Protocol):
         """The worlds some steps later; `world` does not change."""
 
 
-class MixedPart(NamedTuple):
-    """Worlds of one structure: their numbers in the batch, and their chances, float64 [worlds] by parameter."""
-
-    world: World
-    numbers: Tensor
-    params: Mapping[str, Tensor]
-
-
 @dataclass(frozen=True)
-class MixedWorld:
-    """A batch of worlds of several rulesets."""
+class Batch:
+    """Worlds of one seed each, which may run under different rulesets: by ruleset their numbers and their episodes."""
 
-    parts: tuple[MixedPart, ...]
+    parts: tuple[tuple[Tensor, Episodes], ...]
 
     @property
     def ids(self) -> Tensor:
         """Element ids, uint8 [B, H, W]."""
         if len(self.parts) == 1:
-            return self.parts[0].world.ids
-        order = torch.cat([part.numbers for part in self.parts]).argsort()
-        return torch.cat([part.world.ids for part in self.parts])[order]
+            return self.parts[0][1].world.ids
+        order = torch.cat([numbers for numbers, _ in self.parts]).argsort()
+        return torch.cat([episodes.world.ids for _, episodes in self.parts])[order]
 
 
 class TaskWorlds:
     """The worlds of a configuration, ready to run: those of a task's split under some rules.
 
-    World s runs under ruleset s mod the number of `rulesets`. Rulesets of one structure are compiled once and run
-    together; their chances are parameters of each world.
+    Where the split has laws, each world has its own.
 
     Args:
         partly: leave out worlds that the rules cannot have; `missing` says which.
@@ -118,82 +99,54 @@ class TaskWorlds:
     ):
         params = None if config.rules else config.params
         task = load_task(config.task, knobs=config.knobs, params=params, palette=palette)
-        source = None
-        if config.rulesets:
-            source = RulesetSource(config.rules or task.rules, config.variety, config.params, palette)
-            rules = source.base
-        elif config.rules:
-            rules = load(config.rules, params=config.params, palette=palette)
-        else:
-            rules = task.ruleset
-        check_data(config, task, rules)
-        watched, self.missing = watch(task, config.split, rules, config.only, partly=partly)
+        check_split(task, config.split)
+        laws = task.split(config.split)
+        rules = load(config.rules, params=config.params, palette=palette) if config.rules else task.ruleset
+        self.missing: tuple[Missing, ...] = ()
+        if not laws.rulesets:
+            if config.rulesets:
+                raise failure("PD801", f"the split {config.split} of {task.name} has no `rulesets`")
+            check_data(config, task, rules)
+            task, self.missing = watch(task, config.split, rules, config.only, partly=partly)
+        elif config.rules or config.only:
+            raise failure("PD801", f"the split {config.split} of {task.name} has rulesets of its own")
+        elif machine.get("backend", "auto") == "auto":
+            # Compiling many rulesets would take longer than running them.
+            machine = {**machine, "backend": starting_backend(str(machine.get("device", "cpu")))}
         self.config, self.rules, self.size = config, rules, task.size
-        self.names = tuple(variant.name for variant in watched.splits[0].variants)
+        split = task.split(config.split)
+        self.names = tuple(variant.name for variant in split.variants)
         """The names of the variants: seed s gives variant s mod their number."""
-        self.fingerprint = fingerprint(watched.splits)
-        """A name for how these worlds start, besides their rules: another if the task's file has been changed."""
+        self.fingerprint = fingerprint((split,))
+        """A name for how these worlds start, and for laws they draw: another if the task's file has been changed."""
         self.device = torch.device(machine.get("device", "cpu"))
         """Where worlds are run."""
-        self._task, self._source = task, source
-        self._machine = machine
-        self._programs: dict[tuple[Any, ...], TaskProgram] = {}
-        if source is None:
-            self.rulesets = [Drawn(0)]
-            self._programs[self.rulesets[0].structure] = self._compiled(watched)
-            return
-        numbers = range(config.first_ruleset, config.first_ruleset + config.rulesets)
-        self.rulesets = [source.draw(number) for number in numbers]
-        # Compiling many rulesets would take longer than running them.
-        if machine.get("backend", "auto") == "auto":
-            self._machine = {**machine, "backend": starting_backend(str(self.device))}
+        self._program = compile_task(task, split=config.split, rulesets=config.rulesets, **machine)
 
-    def start(self, seeds: Tensor) -> MixedWorld:
+    def start(self, seeds: Tensor) -> Batch:
         """The worlds of seeds, int64 [B]."""
-        groups: dict[tuple[Any, ...], list[int]] = {}
-        rulesets = [self.rulesets[seed % len(self.rulesets)] for seed in seeds.tolist()]
-        for number, drawn in enumerate(rulesets):
-            groups.setdefault(drawn.structure, []).append(number)
+        rulesets = self._program.ruleset_of(seeds)
         parts = []
-        for members in groups.values():
-            numbers = torch.tensor(members, device=seeds.device)
-            world = self._program(rulesets[members[0]]).start(seeds[numbers]).world
-            chances = [dict(rulesets[member].params) for member in members]
-            params = {
-                name: torch.tensor([own[name] for own in chances], dtype=torch.float64, device=seeds.device)
-                for name in chances[0]
-            }
-            parts.append(MixedPart(world, numbers, params))
-        return MixedWorld(tuple(parts))
+        for ruleset in rulesets.unique().tolist():
+            numbers = (rulesets == ruleset).nonzero()[:, 0]
+            parts.append((numbers, self._program.under(ruleset).start(seeds[numbers])))
+        return Batch(tuple(parts))
 
-    def later(self, world: MixedWorld, steps: int) -> MixedWorld:
-        later = [
-            part._replace(world=part.world.sim.step(part.world, steps, params=part.params or None))
-            for part in world.parts
-        ]
-        return MixedWorld(tuple(later))
+    def later(self, world: Batch, steps: int) -> Batch:
+        def stepped(episodes: Episodes) -> Episodes:
+            now = episodes.world
+            return replace(episodes, world=now.sim.step(now, steps, params=episodes.params or None))
 
-    def _program(self, drawn: Drawn) -> TaskProgram:
-        if drawn.structure not in self._programs:
-            assert self._source is not None
-            # Rules without some packs draw from the remaining elements; worlds that need others are replaced.
-            rules = self._source.model(drawn)
-            task, _ = watch(self._task, self.config.split, rules, self.config.only, partly=True)
-            self._programs[drawn.structure] = self._compiled(task)
-        return self._programs[drawn.structure]
-
-    def _compiled(self, task: Task) -> TaskProgram:
-        return compile_task(task, split=self.config.split, **self._machine)
+        return Batch(tuple((numbers, stepped(episodes)) for numbers, episodes in world.parts))
 
 
 def check_data(config: DataConfig, task: Task, rules: Ruleset) -> None:
-    """Raise CompileError if a task lacks a configuration's split, or rules its packs or properties."""
+    """Raise CompileError if a task lacks a configuration's split, or rules its packs."""
     check_split(task, config.split)
     for pack in config.only:
         if pack not in rules.packs:
             helps = suggest(pack, rules.packs, "packs")
             raise failure("PD304", f"the rules {rules.name} have no pack `{pack}`", helps=helps)
-    check_properties(rules, config.variety.swaps)
 
 
 # Pairs
@@ -263,7 +216,7 @@ def watch(
     if missing and not (partly and variants):
         raise _missing_elements(task, rules, missing, only)
     agent = replace(task.agent, choices=(NO_CHANGE,), speed_field=None)
-    watched = Split(original.name, original.about, tuple(variants))
+    watched = replace(original, variants=tuple(variants))
     nothing = Goal(None, None, None, None)
     return replace(task, ruleset=rules, agent=agent, goal=nothing, splits=(watched,)), tuple(missing)
 
@@ -457,158 +410,3 @@ def open_recording(folder: str | Path, task: str | None = None) -> Recording:
     if notes:
         raise failure("PD631", f"{folder} does not fit the task {played.name}", notes=notes)
     return Recording(dataset, name, played, palette)
-
-
-TRIES = 8
-"""How often a swap or a selection of packs is drawn again if the rules are inconsistent."""
-
-UNSEEN_RULESETS = 1 << 32
-"""The first number of rulesets that models are tested on. Training takes numbers below it."""
-
-_DRAW = 0x9F1D
-"""The number of the hash by which rulesets are drawn."""
-
-
-@dataclass(frozen=True)
-class Drawn:
-    """A ruleset that was drawn. `left_out`: packs; `swapped`: property and two elements; `params`: other chances."""
-
-    number: int
-    left_out: tuple[str, ...] = ()
-    swapped: tuple[tuple[str, str, str], ...] = ()
-    params: tuple[tuple[str, float], ...] = ()
-
-    @property
-    def structure(self) -> tuple[Any, ...]:
-        """The changes that decide the compiled code. Parameters, which are inputs of each world, are not among them."""
-        return self.left_out, self.swapped
-
-
-def check_properties(rules: Ruleset, names: Sequence[str]) -> None:
-    """Raise CompileError (PD301) for a property that rules do not have."""
-    for name in names:
-        if rules.property(name) is None:
-            helps = suggest(name, [prop.name for prop in rules.properties], "properties")
-            raise failure("PD301", f"the rules {rules.name} have no property `{name}`", helps=helps)
-
-
-class RulesetSource:
-    """Draws rulesets around one, which is `rules` as everywhere. The same number gives the same ruleset.
-
-    `palette` has ids that were recorded, as `compiler.load` takes them. Raises CompileError: what loading the rules
-    raises; PD301 for a property that they do not have.
-    """
-
-    def __init__(
-        self,
-        rules: str | Sequence[str],
-        variety: Variety,
-        params: Mapping[str, Any] | None = None,
-        palette: Palette | None = None,
-    ):
-        reporter = Reporter()
-        self.packs, self.ruleset_decl = read([rules] if isinstance(rules, str) else rules, reporter)
-        reporter.raise_if_errors()
-        self.variety, self.params, self.palette = variety, params or {}, palette
-        self.base = self._checked(self.packs)
-        self._models = {Drawn(0).structure: self.base}
-        self.palette = palette or self.base.palette  # ids stay where they are when packs are left out
-        check_properties(self.base, variety.swaps)
-
-    def draw(self, number: int) -> Drawn:
-        """Ruleset `number`, 0 or more. Inconsistent rulesets are drawn again."""
-        draws = _draws(number)
-        for _ in range(TRIES):
-            left_out = self._left_out(draws)
-            drawn = Drawn(number, left_out, self._swapped(draws, left_out))
-            try:
-                model = self.model(drawn)
-            except CompileError:
-                continue
-            return replace(drawn, params=self._chances(draws, model))
-        return Drawn(number, params=self._chances(draws, self.base))
-
-    def model(self, drawn: Drawn) -> Ruleset:
-        """The checked model of a ruleset, with the base's parameters. Raises CompileError for inconsistent rules."""
-        if drawn.structure not in self._models:
-            packs = [pack for pack in self.packs if pack.name.text not in drawn.left_out]
-            for prop, first, second in drawn.swapped:
-                packs = _exchanged(packs, prop, first, second)
-            self._models[drawn.structure] = self._checked(packs)
-        return self._models[drawn.structure]
-
-    def _checked(self, packs: Sequence[PackDecl]) -> Ruleset:
-        reporter = Reporter()
-        model = check(list(packs), self.ruleset_decl, reporter, self.palette)
-        left_out = {pack.name.text for pack in self.packs} - {pack.name.text for pack in packs}
-        params = {name: self.params[name] for name in self.params if name.partition(".")[0] not in left_out}
-        model = set_params(model, params, reporter) if params else model
-        reporter.raise_if_errors()
-        return model
-
-    def _left_out(self, draws: Iterator[float]) -> tuple[str, ...]:
-        """The packs that are left out, drawn one at a time; packs that others need stay."""
-        if not self.variety.leave_out:
-            return ()
-        needed = {name.text for pack in with_stand_ins(self.packs).values() for name in pack.needs}
-        loose = [pack.name.text for pack in self.packs if pack.name.text not in needed]
-        return tuple(name for name in loose if next(draws) < self.variety.leave_out)
-
-    def _swapped(self, draws: Iterator[float], left_out: tuple[str, ...]) -> tuple[tuple[str, str, str], ...]:
-        """For each property, two elements with different values."""
-        packs = [pack for pack in self.packs if pack.name.text not in left_out]
-        swapped = []
-        for prop in self.variety.swaps:
-            values = _values(packs, prop)
-            pairs = [pair for pair in combinations(values, 2) if values[pair[0]] != values[pair[1]]]
-            if pairs:
-                swapped.append((prop, *pairs[int(next(draws) * len(pairs))]))
-        return tuple(swapped)
-
-    def _chances(self, draws: Iterator[float], model: Ruleset) -> tuple[tuple[str, float], ...]:
-        """The chances of the model, each multiplied by a factor. All chances of the base draw one."""
-        if self.variety.chances == 1:
-            return ()
-        spread, names = math.log(self.variety.chances), {param.name for param in model.params}
-        chances = []
-        for param in self.base.params:
-            if param.kind.name == "chance":
-                factor = math.exp(spread * (2 * next(draws) - 1))
-                if param.name in names:
-                    chances.append((param.name, min(1.0, float(param.default) * factor)))
-        return tuple(chances)
-
-
-def _draws(number: int) -> Iterator[float]:
-    """Endless numbers from 0 to 1 that depend on `number` alone."""
-    keys = base_keys(torch.tensor([number]), torch.tensor([_DRAW]))
-    key, count = int(mix(keys[0] ^ keys[1])[0]), 0
-    while True:
-        yield int(mix(torch.tensor((key + count * 0x9E3779B1) & MASK))) / 2**32
-        count += 1
-
-
-def _values(packs: Iterable[PackDecl], prop: str) -> dict[str, Any]:
-    """The values of a property as elements declare them, by name."""
-    return {
-        element.name.text: syntax
-        for pack in packs
-        for element in pack.elements
-        for name, syntax in element.values
-        if name.text == prop
-    }
-
-
-def _exchanged(packs: Sequence[PackDecl], prop: str, first: str, second: str) -> list[PackDecl]:
-    """Packs in which two elements have exchanged their values of a property."""
-    values = _values(packs, prop)
-    new = {first: values[second], second: values[first]}
-
-    def exchanged(element: ElementDecl) -> ElementDecl:
-        swapped = tuple(
-            (name, new.get(element.name.text, syntax) if name.text == prop else syntax)
-            for name, syntax in element.values
-        )
-        return replace(element, values=swapped)
-
-    return [replace(pack, elements=tuple(map(exchanged, pack.elements))) for pack in packs]

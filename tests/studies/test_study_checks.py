@@ -107,8 +107,6 @@ def test_shipped_studies_pass(name: str) -> None:
         (AGENTS, "preset: $size", "envs: 1, rollout: 1", "PD640", "trained"),
         (AGENTS, "seed: $seed", "seed: $seed, batch: 100$", "PD806", "100$"),
         (MODELS, "iterations: 5", "iterations: 0", "PD806", "0"),
-        (MODELS, "knob: kinds=$elements", "knob: kinds=$elements, chances: 3", "PD806", "3"),
-        (MODELS, "knob: kinds=$elements", "knob: kinds=$elements, rulesets: 2, chances: 0.5", "PD806", "0.5"),
         (AGENTS, "preset: $size", "device: cdua", "PD701", "cdua"),
         (AGENTS, "episodes: 4", "device: cuda:99", "PD701", "cuda:99"),
         (MODELS, "split: held_out", "device: [cpu, cdua]", "PD806", "cdua"),
@@ -122,7 +120,6 @@ def test_shipped_studies_pass(name: str) -> None:
         (MODELS, "packs: [gas, acid]", "packs: [gas, acdi]", "PD304", "acdi"),
         (MODELS, "packs: [gas, acid], ", "", "PD806", "tuned"),
         (MODELS, "split: held_out", "split: held_out, only: [gas, wood]", "PD304", "wood"),
-        (MODELS, "knob: kinds=$elements", "knob: kinds=$elements, rulesets: 2, swap: densty", "PD301", "densty"),
         (MODELS, "split: held_out", "rules: powderwolrd", "PD304", "powderwolrd"),
         (MODELS, "held-out: [gas, acid]", "on: world-modle", "PD801", "world-modle"),
         # measures

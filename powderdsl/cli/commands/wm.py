@@ -14,7 +14,7 @@ from powderdsl.cli import options as opt
 from powderdsl.cli.exits import BadInput, user_values
 from powderdsl.cli.output import print_json, progress
 from powderdsl.system.reports import table
-from powderdsl.worldmodel.config import PRESETS, DataConfig, TrainConfig, Variety
+from powderdsl.worldmodel.config import PRESETS, DataConfig, TrainConfig
 
 if TYPE_CHECKING:
     from powderdsl.model.types import Ruleset
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from powderdsl.worldmodel.worlds import Recording
 
 
-OF_WORLDS = {field.name for field in (*fields(DataConfig), *fields(Variety))} - {"task"}
+OF_WORLDS = {field.name for field in fields(DataConfig)} - {"task"}
 OF_WORLDS |= {"packs", "held_out", "settings", "worlds", "after"}
 """Options that select worlds: a dataset has its own."""
 MACHINE = ("device", "threads", "backend", "store")
@@ -86,7 +86,6 @@ def command() -> None:
 @opt.option("--ignore-actions", bool, "With --data: the network does not see the actions.")
 @opt.settings_of(DataConfig, {name: vars(preset.data) for name, preset in PRESETS.items()})
 @opt.settings_of(TrainConfig, {name: vars(preset) for name, preset in PRESETS.items()})
-@opt.settings_of(Variety, {name: vars(preset.data.variety) for name, preset in PRESETS.items()})
 @opt.option("--rules", "RULES", "Rules of the worlds.  [default: the task's own]")
 @opt.pack_list("--packs", "Keep only these packs of the rules, or add them.")
 @opt.pack_list("--held-out", "Leave these packs of the rules out.")
@@ -127,11 +126,6 @@ def new_config(values: Mapping[str, Any], rules_of: Callable[..., str]) -> Train
     packs, held_out = values["packs"], values["held_out"]
     if packs and held_out:
         raise BadInput("--packs says what stays, --held-out what goes: give one of them")
-    variety = opt.given_settings(values, Variety)
-    if (variety or values["first_ruleset"]) and not values["rulesets"]:
-        raise BadInput(
-            "--chances, --swap, --leave-out and --first-ruleset say which rulesets: --rulesets says how many"
-        )
     with user_values():
         config = replace(PRESETS[values["preset"]], **opt.given_settings(values, TrainConfig))
         rules, task = values["rules"] or "", values["task"] or config.data.task
@@ -140,7 +134,6 @@ def new_config(values: Mapping[str, Any], rules_of: Callable[..., str]) -> Train
             "rules": rules_of(rules, task, packs, held_out) if packs or held_out else rules,
             "knobs": values["knobs"],
             "params": values["settings"],
-            "variety": Variety(**variety),
         }
         return replace(config, data=replace(config.data, **changes))
 
@@ -177,9 +170,6 @@ def finetune_command(run: str, packs: tuple[str, ...], folder: Path | None, **va
 @opt.knobs("Another value for a knob of the task.  [default: the run's]")
 @opt.option(
     "--worlds", (1, 1 << 20), "Worlds of the split, or futures of each designed world.  [default: 32, 4]"
-)
-@opt.option(
-    "--rulesets", (0, 1024), "Number of rulesets that training never saw, to test under.  [default: 0]"
 )
 @opt.option("--json", bool, "One JSON object instead of a table.", to="as_json")
 def eval_command(run: str, as_json: bool, **values: Any) -> None:
@@ -246,7 +236,7 @@ def _show(strips: list[Strip], rules: Ruleset, out: Path, scale: int) -> None:
 
 def tested_on(values: Mapping[str, Any]) -> dict[str, Any]:
     """Return the options that choose the worlds of a test."""
-    return opt.given_options(values, ("task", "split", "rules", "only", "knobs", "rulesets"))
+    return opt.given_options(values, ("task", "split", "rules", "only", "knobs"))
 
 
 def _machine(values: dict[str, Any]) -> Machine:
