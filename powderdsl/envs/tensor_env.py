@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -49,7 +49,9 @@ class Observation:
 
     def of(self, episodes: Episodes | MixedEpisodes) -> Tensor:
         """The observations of a batch, in memory of their own: [B, *space.shape]."""
-        world: Any = episodes.world
+        if isinstance(episodes, MixedEpisodes):
+            return episodes.joined(lambda program, part: replace(self, laws=program.laws).of(part))
+        world = episodes.world
         shape, dtype = (len(world), *self.space.shape), getattr(torch, self.space.dtype.name)
         out = torch.empty(shape, dtype=dtype, device=world.seed.device)
         if self.kind in ("ids", "laws"):
@@ -57,11 +59,7 @@ class Observation:
         else:
             getattr(world, self.kind)(out)
         if self.kind == "laws":
-            told = (
-                episodes.joined(TaskProgram.told)
-                if isinstance(episodes, MixedEpisodes)
-                else self.laws.of(episodes.params, len(episodes))
-            )
+            told = self.laws.of(episodes.params, len(episodes))
             out[:, 1] = 0
             out[:, 1].flatten(1)[:, : told.shape[1]] = told
         return out

@@ -23,43 +23,19 @@ class Playing(Protocol):
 
 
 class MixedWorld:
-    """Worlds of several simulators, in the order of their environments, to read."""
+    """Worlds of several simulators, in the order of their environments, to draw."""
 
     def __init__(self, parts: Sequence[World], rows: Sequence[Array]):
         self._parts, self._rows = parts, rows
-
-    def __len__(self) -> int:
-        return sum(map(len, self._rows))
-
-    @property
-    def seed(self) -> Tensor:
-        """The seeds of their random numbers, int64 [B]."""
-        return joined([part.seed for part in self._parts], self._rows)
 
     @property
     def ids(self) -> Tensor:
         """The elements, uint8 [B, H, W]."""
         return joined([part.ids for part in self._parts], self._rows)
 
-    def read(self, name: str, out: Tensor) -> Tensor:
-        """One field, written into a tensor [B, H, W]; see `World.read`."""
-        return self._write(lambda part: part.read(name), out)
-
-    def compact(self, out: Tensor) -> Tensor:
-        """The observation ``compact``, written into a tensor."""
-        return self._write(World.compact, out)
-
-    def matrix(self, out: Tensor) -> Tensor:
-        """The observation ``matrix``, written into a tensor."""
-        return self._write(World.matrix, out)
-
-    def rgb(self, out: Tensor | None = None) -> Tensor:
-        """Pictures, uint8 [B, H, W, 3], each in the colors of its rules; written into a tensor if one is given."""
-        pictures = joined([part.rgb() for part in self._parts], self._rows)
-        return pictures if out is None else out.copy_(pictures)
-
-    def _write(self, read: Callable[[World], Tensor], out: Tensor) -> Tensor:
-        return out.copy_(joined([read(part) for part in self._parts], self._rows))
+    def rgb(self) -> Tensor:
+        """Pictures, uint8 [B, H, W, 3], each in the colors of its rules."""
+        return joined([part.rgb() for part in self._parts], self._rows)
 
 
 class MixedEpisodes:
