@@ -288,6 +288,15 @@ class Task:
         goal = replace(self.goal, each=self.goal.shaped, final=None, shaped=None)
         return replace(self, goal=goal, origin=self.origin and replace(self.origin, shaped=True))
 
+    def is_held_out(self, split: Split) -> bool:
+        """Whether no world of a split has the rules, or the value of some parameter, of a world of `train`."""
+        train = self.split("train")
+        if split.rulesets and not {*split.rulesets} & ({*train.rulesets} or {self.rules}):
+            return True
+        usual = {part.name: part for part in train.params}
+        pairs = [(part, usual[part.name]) for part in split.params if part.name in usual]
+        return any(own.low > trained.high or own.high < trained.low for own, trained in pairs)
+
     def split(self, name: str) -> Split:
         """The split of a name. Raises KeyError."""
         for split in self.splits:

@@ -142,6 +142,18 @@ def test_each_world_draws_by_its_number_within_the_range_of_its_split() -> None:
     assert load_task("sand-pushing").split("train").params == ()
 
 
+def test_check_says_which_splits_have_laws_of_their_own(mixed: Path, tmp_path: Path) -> None:
+    from tests.cli.commands import powderdsl as run
+
+    melting = tmp_path / "melting.yaml"
+    melting.write_text(MELTING, encoding="utf-8")
+    checked = run("check", str(mixed / "mixed.yaml"), str(melting)).output
+    assert "dissolving: 2 splits, laws of test held out of train, no errors" in checked
+    assert "melting: 3 splits, laws of test held out of train, no errors" in checked
+    shown = run("show", str(mixed / "mixed.yaml")).output
+    assert "3 rulesets" in shown
+
+
 def test_a_parameter_that_is_set_is_not_drawn() -> None:
     task = read_task(Source("test.yaml", MELTING), Reporter(), params={"water.melt": 0.25})
     assert [split.params for split in task.splits] == [()] * 3

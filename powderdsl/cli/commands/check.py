@@ -185,6 +185,8 @@ def _summary(result: Checked, notes: bool) -> str:
         parts += [counted(len(loaded.elements), "element"), counted(len(loaded.passes), "pass", "passes")]
     elif loaded is not None:
         parts.append(counted(len(loaded.splits), "split"))
+        if held_out := [split.name for split in loaded.splits if loaded.is_held_out(split)]:
+            parts.append(f"laws of {', '.join(held_out)} held out of train")
     if result.claims:
         verdicts = Counter(claim["status"] for claim in result.claims)
         numbers = ", ".join(f"{number} {status}" for status, number in verdicts.items())
