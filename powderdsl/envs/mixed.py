@@ -125,11 +125,11 @@ class MixedEnv(CompiledEnv):
         self._order = np.arange(num_envs)
         """Where in the groups, one after another, each episode is."""
 
-    def _env(self, number: int, worlds: int) -> CompiledEnv:
+    def _env(self, number: int) -> CompiledEnv:
+        """The environment of the episodes under a ruleset."""
         if number not in self._envs:
             env = CompiledEnv(
                 self.program.under(number),
-                worlds,
                 observation=self.observation.kind,
                 autoreset_mode="disabled",
                 last_action="terminates" if self.last_action_terminates else "truncates",
@@ -137,10 +137,10 @@ class MixedEnv(CompiledEnv):
                 actions=self.action_form.kind,
             )
             ours, theirs = (
-                (each.observation.channels, each.single_action_space, each.action_form.table.tolist())
+                (each.observation.channels, each.single_action_space, each.task.agent.choices)
                 for each in (self, env)
             )
-            if ours[:2] != theirs[:2]:
+            if ours != theirs:
                 rules = "+".join(self.program.rulesets[number])
                 raise ValueError(f"{self.task.name}: observations or actions are others under {rules}")
             self._envs[number] = env
@@ -158,10 +158,12 @@ class MixedEnv(CompiledEnv):
         """Begin episodes where `mask`, bool [B], is set, in the worlds of those numbers, int64 [B]."""
         rows = mask.nonzero()[:, 0].numpy()
         numbers = self.program.ruleset_of(worlds).numpy()
+        for number in numbers[rows].tolist():
+            self._env(number)  # what is wrong with rules is raised before anything has changed
         began = np.zeros(self.num_envs, bool)
         began[rows] = True
         for number in sorted({*self._groups, *numbers[rows].tolist()}):
-            env, old = self._groups.get(number, (None, rows[:0]))
+            _, old = self._groups.get(number, (None, rows[:0]))
             kept, new = ~began[old], rows[numbers[rows] == number]
             if kept.all() and not len(new):
                 continue
@@ -169,7 +171,7 @@ class MixedEnv(CompiledEnv):
             if not len(members):
                 del self._groups[number]
                 continue
-            env = env or self._env(number, len(members))
+            env = self._env(number)
             self._groups[number] = env, members
             episodes = env.program.start(worlds[new]) if len(new) else None
             returned = torch.zeros(len(members), dtype=torch.float64)
@@ -318,7 +320,7 @@ class MixedEnv(CompiledEnv):
             env.restore(saved["env"])
             episodes, returned, params = env.episodes, env.returns, env.params
             assert episodes is not None
-            groups[number] = self._env(number, len(rows)), rows
+            groups[number] = self._env(number), rows
             groups[number][0].adopt(episodes, returned, params)
         members = np.concatenate([rows for _, rows in groups.values()])
         if sorted(members.tolist()) != [*range(self.num_envs)]:

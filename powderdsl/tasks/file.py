@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from itertools import count
 from typing import Any
@@ -186,7 +186,13 @@ def task_under(task: Task, rules: Sequence[str]) -> Task:
     origin = task.origin
     assert origin is not None
     knobs, params, packs = origin.knobs, origin.params, origin.packs
-    other = read_task(origin.source, Reporter(), knobs=knobs, params=params, packs=packs, rules=rules)
+    try:
+        other = read_task(origin.source, Reporter(), knobs=knobs, params=params, packs=packs, rules=rules)
+    except CompileError as error:
+        note = f"the split gives worlds the rules {'+'.join(map(str, rules))}"
+        raise CompileError(
+            [replace(mistake, notes=(*mistake.notes, note)) for mistake in error.diagnostics]
+        ) from None
     return other.with_shaped_reward() if origin.shaped else other
 
 
@@ -382,11 +388,10 @@ class _TaskReader:
         known = {param.name: param for param in self.ruleset.params}
         ranges = dict(train)
         for word, value in entries:
-            ends_so = [name for name in known if name == word.text or name.endswith(f".{word.text}")]
-            if len(ends_so) != 1:
+            name = _qualified(word, known)
+            if name is None:
                 report_unknown("parameter", word, known, self.reporter)
                 continue
-            name = ends_so[0]
             if name in self.origin.params or (entries is self.decl.params and RANGE not in value.text):
                 continue
             kind, (low, dots, high) = known[name].kind, value.text.partition(RANGE)
@@ -427,12 +432,12 @@ class _TaskReader:
             label, helps = f"{names}: also in `train`", ["choose rules that training does not show"]
             message = f"the split `{decl.name.text}` has {len(common)} rulesets of `train`"
             self.reporter.report("PD807", message, decl.rulesets[0].span, label, helps=helps)
-        for name, value in decl.params:
-            ends_so = [other for other in own[0] if other == name.text or other.endswith(f".{name.text}")]
-            usual, drawn = (laws[0].get(ends_so[0]) if ends_so else None for laws in (train, own))
+        for word, value in decl.params:
+            name = _qualified(word, own[0])
+            usual, drawn = (laws[0].get(name) if name else None for laws in (train, own))
             if usual and drawn and drawn.low <= usual.high and usual.low <= drawn.high:
                 label = f"`train` draws from {usual.low:g}..{usual.high:g}"
-                message = f"the split `{decl.name.text}` draws values of `{name.text}` that `train` draws too"
+                message = f"the split `{decl.name.text}` draws values of `{word.text}` that `train` draws too"
                 self.reporter.report(
                     "PD807", message, value.span, label, helps=["choose ranges that are apart"]
                 )
@@ -484,3 +489,9 @@ class _TaskReader:
         ends = (end.success, end.failure)
         success, failure = (checker.condition(line) if line else None for line in ends)
         return Goal(each, final, success, failure, shaped)
+
+
+def _qualified(word: Scalar, names: Iterable[str]) -> str | None:
+    """The one of some parameters that a word names, with its pack or without; None if there are none or several."""
+    fitting = [name for name in names if name == word.text or name.endswith(f".{word.text}")]
+    return fitting[0] if len(fitting) == 1 else None

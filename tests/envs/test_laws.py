@@ -278,6 +278,28 @@ def test_laws_tell_rulesets_apart(mixed: Path) -> None:
     assert (observed[:, 1].flatten(1)[:, count:] == 0).all()
 
 
+def test_rules_that_a_task_does_not_fit_are_refused(mixed: Path) -> None:
+    from powderdsl.envs.mixed import environment
+    from tests.cli.commands import powderdsl as run
+
+    (mixed / "p8.yaml").write_text(
+        PACK.format(number=8, pool=2, bite=5, solvent="pool").replace("crust", "shell")
+    )
+    (mixed / "p9.yaml").write_text(
+        PACK.format(number=9, pool=2, bite=5, solvent="pool").replace("id: 3", "id: 9")
+    )
+    place = mixed / "wrong.yaml"
+    place.write_text(MIXED.replace("p2.yaml]", "p8.yaml]"), encoding="utf-8")
+    checked = run("check", str(place), exits=2).output
+    assert "unknown element `crust`" in checked
+    assert "note: the split gives worlds the rules " in checked
+    place.write_text(MIXED.replace("p2.yaml]", "p9.yaml]"), encoding="utf-8")
+    env = environment(place, 3, backend="wasm")
+    with pytest.raises(ValueError, match=r"observations or actions are others under .*p9"):
+        env.reset(seed=0)
+    assert env.episodes is None
+
+
 def test_plain_environments_refuse_several_rulesets(mixed: Path) -> None:
     from powderdsl.envs.tensor_env import TensorEnv
 

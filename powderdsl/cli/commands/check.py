@@ -128,9 +128,13 @@ def _lines(result: Checked, notes: bool, claims: bool) -> Iterator[str]:
 def _check(name: str, prove: int | None, cost: bool, ledger: bool) -> Checked:
     try:
         if is_task(name):
+            from powderdsl.tasks.file import task_under
             from powderdsl.tasks.shipped import load_task_with_diagnostics  # brings numpy
 
             task, diagnostics = load_task_with_diagnostics(name)
+            for split in task.splits:  # those between the first and the last are of the same kind
+                for rules in dict.fromkeys(split.rulesets[:1] + split.rulesets[-1:]):
+                    task_under(task, rules)
             return Checked(name, diagnostics, task)
         ruleset, diagnostics = load_with_diagnostics(name)
     except CompileError as error:
