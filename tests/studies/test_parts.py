@@ -5,9 +5,11 @@ from __future__ import annotations
 import json
 import os
 import re
+import shutil
 import subprocess
 import threading
 from pathlib import Path
+from typing import Any
 
 import pytest
 from filelock import FileLock
@@ -233,6 +235,24 @@ def test_points_that_others_hold_are_left_to_them(steps_run: list[str], quick: N
     powderdsl("study", "study.yaml", "--out", "out", exits=0)
     assert steps_run[-1] == place.name
     assert len(steps_run) == POINTS
+
+
+def test_who_finishes_last_writes_the_table(
+    steps_run: list[str], quick: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    powderdsl("study", "study.yaml", "--out", "one")
+    _, point, place = prepared("out")
+    run = StudyRun.run
+
+    def run_beside_another(self: StudyRun, *arguments: Any) -> list[Any]:
+        outcomes = run(self, *arguments)
+        shutil.copy(f"one/done/{point.name}.json", "out/done")
+        return outcomes
+
+    monkeypatch.setattr(StudyRun, "run", run_beside_another)
+    with FileLock(place / ".lock"):
+        powderdsl("study", "study.yaml", "--out", "out", exits=0)
+    assert Path("out/results.md").read_bytes() == Path("one/results.md").read_bytes()
 
 
 def prepared(folder: str) -> tuple[StudyRun, Point, Path]:

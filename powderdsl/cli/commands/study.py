@@ -220,7 +220,11 @@ def command(
     if ray is not None:
         check_cluster(ray)
     run.prepare()
-    outcomes = {outcome.point: outcome for outcome in _with_progress(run, points, jobs, ray)}
+    outcomes = {
+        outcome.point: (run.finished(outcome.point) if outcome.held else None)
+        or outcome  # it may be done by now
+        for outcome in _with_progress(run, points, jobs, ray)
+    }
     finished = [outcomes.get(point) or run.finished(point) for point in every]
     locked, missing = sum(outcome.held for outcome in outcomes.values()), finished.count(None)
     if locked:
