@@ -44,7 +44,7 @@ class TrainConfig:
         choices=("uniform", "prioritized"),
     )
     worlds: int = setting(1_000_000, "How many worlds there are to draw from.", 1, 2**62)
-    rulesets: int = setting(0, "Only so many rulesets of the split; 0: all.", 0, 1 << 16)
+    rulesets: int = setting(0, "Only so many rulesets of the split; 0: all.", 0, 4096)
     observation: str = setting("compact", "Observation of the network.", choices=OBSERVATIONS)
     network: str = setting(
         "paper", "The paper's, a small one, or a fully convolutional one.", choices=tuple(USUAL_OBSERVATION)

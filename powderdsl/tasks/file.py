@@ -130,7 +130,7 @@ RANGE = ".."
 
 NUMBERS = re.compile(r"([0-9]{1,10})\.\.([0-9]{1,10})")
 
-MAX_RULESETS = 1 << 16
+MAX_RULESETS = 4096
 """Rulesets of one split."""
 
 Drawn = tuple[dict[str, ParamRange], tuple[tuple[str, ...], ...]]
@@ -413,16 +413,22 @@ class _TaskReader:
             texts = [word.text]
             if numbers is not None:
                 first, last = map(int, numbers.groups())
-                if not 0 <= last - first < MAX_RULESETS:
-                    message = f"`{numbers[0]}` stands for no rulesets, or more than {MAX_RULESETS:,}"
-                    self.reporter.error("PD801", message, word.span, "the smaller number first")
+                if first > last:
+                    message = f"`{numbers[0]}` stands for no rulesets"
+                    self.reporter.error("PD110", message, word.span, "the smaller number comes first")
+                    continue
+                if (total := len(rulesets) + last - first + 1) > MAX_RULESETS:
+                    label = f"the limit is {MAX_RULESETS:,}"
+                    self.reporter.error("PD508", f"{total:,} rulesets in a split", word.span, label)
                     continue
                 before, after = word.text[: numbers.start()], word.text[numbers.end() :]
                 texts = [f"{before}{number}{after}" for number in range(first, last + 1)]
-            names = [names_in_file(text, word.span, self.reporter) for text in (texts[0], texts[-1])]
-            if None not in names:
-                rulesets += [tuple(names_in_file(text, word.span, self.reporter) or ()) for text in texts]
-        return tuple(rulesets[:MAX_RULESETS])
+            for text in texts:
+                names = names_in_file(text, word.span, self.reporter)
+                if names is None:
+                    break  # the others lack the same
+                rulesets.append(tuple(names))
+        return tuple(rulesets)
 
     def held_out(self, decl: SplitDecl, train: Drawn, own: Drawn) -> None:
         """Report laws of a split that training shows too."""

@@ -381,8 +381,10 @@ def test_wrong_rulesets_are_reported(mixed: Path) -> None:
     assert codes("[p1.yaml, p3.yaml]") == ["PD807"]
     assert codes("[../p3.yaml]") == ["PD112"]
     assert codes("[nothing]") == ["PD304"]
-    assert codes("[p9..1.yaml]") == ["PD801"]
-    assert codes("[p0..99999999.yaml]") == ["PD801"]
+    assert codes("[p9..1.yaml]") == ["PD110"]
+    assert codes("[p0..99999999.yaml]") == ["PD508"]
+    assert codes("[universe:0..4095]") == []
+    assert codes("[universe:0..4094, universe:5000..5001]") == ["PD508"]
 
 
 def test_the_small_network_reads_laws(mixed: Path, tmp_path: Path) -> None:
