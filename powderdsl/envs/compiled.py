@@ -52,7 +52,7 @@ class CompiledEnv(TensorEnv):
         self.episodes = self._stepper.bind(self.episodes, self.params, kept)
         self._waiting = self._ended.numpy()
         if self.observation.kind == "laws":
-            self._told = self.program.told(self.episodes).numpy()
+            self._laws = self.program.law_bytes(self.episodes).numpy()
         self._bound = self.episodes, self.params
         return self._stepper
 
@@ -75,20 +75,20 @@ class CompiledEnv(TensorEnv):
         self._ended &= ~mask
         results = self._new_results(stepper)
         stepper.begin()
-        self._tell(results, None)
+        self._write_laws(results, None)
         info: Info = {"success": nobody, "_success": nobody.clone()}
         self._add_ended(info, nobody)
         self._add_shown(info, mask)
         return torch.from_numpy(results.observed), info
 
-    def _tell(self, results: Results, ended: Any) -> None:
+    def _write_laws(self, results: Results, ended: Any) -> None:
         """Write laws behind the elements, if observations have them; `ended`: whose last observations there are."""
         if self.observation.kind != "laws":
             return
         assert self.episodes is not None
-        before, self._told = self._told, self.program.told(self.episodes).numpy()
-        count, cells = self._told.shape[1], results.observed[0, 1].size
-        results.observed.reshape(-1, 2, cells)[:, 1, :count] = self._told
+        before, self._laws = self._laws, self.program.law_bytes(self.episodes).numpy()
+        count, cells = self._laws.shape[1], results.observed[0, 1].size
+        results.observed.reshape(-1, 2, cells)[:, 1, :count] = self._laws
         if results.last_observed is not None and ended is not None:
             lasts = results.last_observed.reshape(-1, 2, cells)
             lasts[: np.count_nonzero(ended), 1, :count] = before[ended]
@@ -143,7 +143,7 @@ class CompiledEnv(TensorEnv):
             stepper.fill(self._numbers)
             stepper.begin()
         info, ended = dict(results.info), results.ended
-        self._tell(results, ended)
+        self._write_laws(results, ended)
         if mode is AutoresetMode.NEXT_STEP:
             info["_success"] = active
         if results.last_observed is not None:

@@ -1,4 +1,4 @@
-"""Which worlds, and so which laws, an agent trains in next: drawn evenly, or more often where it has more to learn."""
+"""Curricula: the choice of the worlds, and so of the laws, that an agent trains in next."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ REPLAY = 0x4C657665
 
 
 class Curriculum(Protocol):
-    """Chooses the worlds of episodes, and is told what came of them."""
+    """Chooses the worlds of episodes, and receives a score for each episode."""
 
     def choose(self, base: Tensor, episode: Tensor, drawn: Tensor) -> Tensor:
         """Return the worlds, int64 [n], of environments' episodes: `drawn`, those of an even choice, or others.
@@ -24,13 +24,13 @@ class Curriculum(Protocol):
         """
 
     def learn(self, worlds: Tensor, scores: Tensor) -> None:
-        """Take note of the worlds of episodes, int64 [n], and how much there is to learn in them, float64 [n]."""
+        """Record scores, float64 [n], of the worlds of episodes, int64 [n]: a high score means that there is more to learn."""
 
     def state(self) -> dict[str, Tensor]:
         """Return everything that later choices depend on."""
 
     def restore(self, state: Mapping[str, Any]) -> None:
-        """Go on from a result of `state`. Raises KeyError if it is none."""
+        """Continue from a result of `state`. Raises KeyError for anything else."""
 
 
 class Prioritized:
@@ -63,7 +63,7 @@ class Prioritized:
         return torch.where(draws[:, 0] < self.replay, self._worlds[places], drawn)
 
     def learn(self, worlds: Tensor, scores: Tensor) -> None:
-        """Take note of scores: see `Curriculum`."""
+        """Record scores: see `Curriculum`."""
         self._time = self._time + 1
         known = dict(
             zip(
@@ -84,7 +84,7 @@ class Prioritized:
         return {name: getattr(self, f"_{name}") for name in ("worlds", "scores", "played", "time")}
 
     def restore(self, state: Mapping[str, Any]) -> None:
-        """Go on from a result of `state`."""
+        """Continue from a result of `state`."""
         self._worlds, self._scores, self._played, self._time = (
             state[name] for name in ("worlds", "scores", "played", "time")
         )

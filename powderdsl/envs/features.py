@@ -120,8 +120,8 @@ class LawPatches(nn.Module):
 
     def forward(self, observed: Tensor) -> Tensor:
         patches = self.see(observed[:, :1])
-        told = observed[:, 1].flatten(1)[:, : self.laws].float() / 127.5 - 1
-        features = self.read(told).relu()[..., None, None].expand(-1, -1, *patches.shape[2:])
+        laws = observed[:, 1].flatten(1)[:, : self.laws].float() / 127.5 - 1
+        features = self.read(laws).relu()[..., None, None].expand(-1, -1, *patches.shape[2:])
         return torch.cat([patches, features], 1)
 
 

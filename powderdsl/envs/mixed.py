@@ -13,7 +13,7 @@ from gymnasium.vector import AutoresetMode
 from torch import Tensor
 
 from powderdsl.envs.compiled import CompiledEnv, Steps, tensors_of
-from powderdsl.envs.tensor_env import Info, TensorEnv, check_going
+from powderdsl.envs.tensor_env import Info, check_going
 from powderdsl.tasks.compiled import Recycled, Results, Stepper
 from powderdsl.tasks.episodes import TaskProgram, load_program
 from powderdsl.tasks.mixed import MixedEpisodes, joined
@@ -41,7 +41,7 @@ COLUMNS = (
     "episode_return",
     "episode_length",
 )
-"""What a step of some episodes gives, a row for each: names of `Results`."""
+"""The results of a step, a row for each episode: names of `Results`."""
 
 
 class Shown(Recycled):
@@ -90,14 +90,13 @@ class Joint:
         if shown is None:
             shown = Shown(np.empty_like(self._observed))
             self._shown = [shown, *self._shown[:2]]
-        np.take(
-            self._observed, self._order, 0, shown.observed, mode="clip"
-        )  # any other mode copies once more
+        # Any other mode copies once more.
+        np.take(self._observed, self._order, 0, shown.observed, mode="clip")
         return [shown.observed, *(values[places] for values, places in self._places)]
 
 
 def _places(memory: Array, parts: Sequence[Array]) -> Array:
-    """Where in some memory, seen as numbers of the parts' dtype, each number of the parts lies: int64 [B]."""
+    """The places of the parts' numbers in some memory that is seen as numbers of their dtype: int64 [B]."""
     start = memory.ctypes.data
     return np.concatenate(
         [(part.ctypes.data - start) // part.itemsize + np.arange(len(part)) for part in parts]
@@ -121,9 +120,9 @@ class MixedEnv(CompiledEnv):
         super().__init__(task, num_envs, **how)
         self._envs: dict[int, CompiledEnv] = {}
         self._groups: dict[int, tuple[CompiledEnv, Array]] = {}
-        """By the number of a ruleset: the environment of its episodes, and which ones they are, int64 [n]."""
+        """The environment of the episodes under each ruleset, and the numbers of these episodes, int64 [n]."""
         self._order = np.arange(num_envs)
-        """Where in the groups, one after another, each episode is."""
+        """The place of each episode in the groups, one after another."""
 
     def _env(self, number: int) -> CompiledEnv:
         """The environment of the episodes under a ruleset."""
@@ -148,26 +147,20 @@ class MixedEnv(CompiledEnv):
 
     # Beginning
 
-    def reset(
-        self, *, seed: int | Sequence[int | None] | None = None, options: Mapping[str, Any] | None = None
-    ) -> tuple[Tensor, Info]:
-        """Begin all episodes, or those of a mask: see `TensorEnv.reset`."""
-        return TensorEnv.reset(self, seed=seed, options=options)
-
     def _restart(self, mask: Tensor, worlds: Tensor) -> None:
         """Begin episodes where `mask`, bool [B], is set, in the worlds of those numbers, int64 [B]."""
         rows = mask.nonzero()[:, 0].numpy()
         numbers = self.program.ruleset_of(worlds).numpy()
         for number in numbers[rows].tolist():
-            self._env(number)  # what is wrong with rules is raised before anything has changed
+            self._env(number)  # raises before anything has changed
         began = np.zeros(self.num_envs, bool)
         began[rows] = True
         for number in sorted({*self._groups, *numbers[rows].tolist()}):
-            _, old = self._groups.get(number, (None, rows[:0]))
-            kept, new = ~began[old], rows[numbers[rows] == number]
-            if kept.all() and not len(new):
+            old = self._groups[number][1] if number in self._groups else rows[:0]
+            staying, new = ~began[old], rows[numbers[rows] == number]
+            if staying.all() and not len(new):
                 continue
-            members = np.concatenate([old[kept], new])
+            members = np.concatenate([old[staying], new])
             if not len(members):
                 del self._groups[number]
                 continue
@@ -175,17 +168,14 @@ class MixedEnv(CompiledEnv):
             self._groups[number] = env, members
             episodes = env.program.start(worlds[new]) if len(new) else None
             returned = torch.zeros(len(members), dtype=torch.float64)
-            if kept.any():
+            if staying.any():
                 assert env.episodes is not None
-                count = int(kept.sum())
-                places = torch.from_numpy(np.flatnonzero(kept))
+                count = int(staying.sum())
+                places = torch.from_numpy(np.flatnonzero(staying))
                 returned[:count] = env.returns[places]
                 repeated = torch.cat([places, places[:1].expand(len(new))])
-                whole = env.program.select(env.episodes, repeated)
-                if episodes is not None:
-                    episodes = env.program.put(whole, torch.arange(count, len(members)), episodes, reuse=True)
-                else:
-                    episodes = whole
+                whole, last = env.program.select(env.episodes, repeated), torch.arange(count, len(members))
+                episodes = whole if episodes is None else env.program.put(whole, last, episodes, reuse=True)
             assert episodes is not None
             known = {param.name for param in env.task.ruleset.params}
             params = {name: value[members] for name, value in self.params.items() if name in known}
@@ -193,7 +183,7 @@ class MixedEnv(CompiledEnv):
         self._regroup(dict(sorted(self._groups.items())))
 
     def _regroup(self, groups: dict[int, tuple[CompiledEnv, Array]]) -> None:
-        """Go on with these groups."""
+        """Continue with these groups."""
         self._groups = groups
         members = np.concatenate([rows for _, rows in groups.values()])
         self._order = np.argsort(members)
@@ -204,7 +194,7 @@ class MixedEnv(CompiledEnv):
         if len(ready) == len(steppers):
             self._joint = Joint(ready, members, space.shape, space.dtype)
         if self.observation.kind == "laws":
-            self._told = episodes.joined(TaskProgram.told).numpy()
+            self._laws = episodes.joined(TaskProgram.law_bytes).numpy()
 
     # Stepping
 
@@ -221,13 +211,13 @@ class MixedEnv(CompiledEnv):
         checked = self.action_form.decode(actions)
         if len(checked) != self.num_envs:
             raise ValueError(f"{len(checked)} actions for {self.num_envs} environments")
-        given, mode = np.asarray(actions), self.autoreset_mode
+        numbers, mode = np.asarray(actions), self.autoreset_mode
         if mode is AutoresetMode.DISABLED:
             check_going(self._ended)
         step = self._step_apart if self._joint is None else self._joint.step
-        observed, reward, terminated, truncated, success, returned, length = step(given)
+        observed, reward, terminated, truncated, success, returned, length = step(numbers)
         if self.observation.kind == "laws":
-            observed[:, 1].reshape(self.num_envs, -1)[:, : self._told.shape[1]] = self._told
+            observed[:, 1].reshape(self.num_envs, -1)[:, : self._laws.shape[1]] = self._laws
         active = np.ones(self.num_envs, bool)
         waiting = self._ended
         if mode is AutoresetMode.NEXT_STEP:
@@ -263,7 +253,7 @@ class MixedEnv(CompiledEnv):
         """Step environment after environment; the columns of `COLUMNS`, rows in the order of `self`."""
         parts = []
         for env, rows in self._groups.values():
-            env._ended.zero_()  # those that wait step too: what comes of it is not shown
+            env._ended.zero_()  # waiting episodes step too; their results are masked below
             *first, info = env.step_arrays(actions[rows])
             parts.append([*first, *(info[name] for name in COLUMNS[4:])])
         return [np.concatenate(column)[self._order] for column in zip(*parts, strict=True)]

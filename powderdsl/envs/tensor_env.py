@@ -59,9 +59,9 @@ class Observation:
         else:
             getattr(world, self.kind)(out)
         if self.kind == "laws":
-            told = self.laws.of(episodes.params, len(episodes))
+            laws = self.laws.of(episodes.params, len(episodes))
             out[:, 1] = 0
-            out[:, 1].flatten(1)[:, : told.shape[1]] = told
+            out[:, 1].flatten(1)[:, : laws.shape[1]] = laws
         return out
 
 
@@ -265,7 +265,7 @@ class TensorEnv:
         return worlds if self.curriculum is None else self.curriculum.choose(base, episode, worlds)
 
     def adopt(self, episodes: Episodes, returned: Tensor, params: Mapping[str, Tensor]) -> None:
-        """Go on with other episodes, as many as they are, none of which is over.
+        """Continue with other episodes, none of which is over; their number may differ.
 
         Args:
             returned: their returns so far, float64 [B].

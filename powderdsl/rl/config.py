@@ -40,11 +40,11 @@ class TrainConfig:
     slots: int = setting(0, "Room for this many elements, for packs that come later.", 0, 256)
     curriculum: str = setting(
         "uniform",
-        "How worlds are drawn: evenly, or where there is more to learn.",
+        "How to choose training worlds: evenly, or by prioritized level replay.",
         choices=("uniform", "prioritized"),
     )
     worlds: int = setting(1_000_000, "How many worlds there are to draw from.", 1, 2**62)
-    rulesets: int = setting(0, "Only so many rulesets of the split; 0: all.", 0, 4096)
+    rulesets: int = setting(0, "Use only the first rulesets of the split, this many; 0: all.", 0, 4096)
     observation: str = setting("compact", "Observation of the network.", choices=OBSERVATIONS)
     network: str = setting(
         "paper", "The paper's, a small one, or a fully convolutional one.", choices=tuple(USUAL_OBSERVATION)

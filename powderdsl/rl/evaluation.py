@@ -163,12 +163,11 @@ def _play_mixed(
 ) -> Played:
     """`play` where worlds run under different rulesets: ruleset by ruleset."""
     numbers = torch.arange(len(worlds)) if numbers is None else numbers
-    rulesets, parts, places = program.ruleset_of(worlds), [], []
-    for ruleset in rulesets.unique().tolist():
-        chosen = (rulesets == ruleset).nonzero()[:, 0]
-        player = policy.under(ruleset) if isinstance(policy, ExpertPlayer) else policy
+    parts, places = [], []
+    for chosen, own in program.apart(worlds):
+        player = policy.under(own.ruleset or 0) if isinstance(policy, ExpertPlayer) else policy
         how: dict[str, Any] = {"numbers": numbers[chosen], "seed": seed}
-        parts.append(play(program.under(ruleset), player, worlds[chosen], observation=observation, **how))
+        parts.append(play(own, player, worlds[chosen], observation=observation, **how))
         places.append(chosen)
     order = torch.cat(places).argsort()
     return Played(*(torch.cat(part)[order] for part in zip(*parts, strict=True)))

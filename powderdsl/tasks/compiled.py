@@ -72,7 +72,7 @@ class Recycled:
         return [*map(getrefcount, self._arrays)]
 
     def is_free(self) -> bool:
-        """Whether nobody else holds an array, or a view of one."""
+        """Return whether nobody else holds an array, or a view of an array."""
         return self._references() == self._counts
 
 
@@ -248,7 +248,7 @@ class Stepper(Plan):
             **rows,
         )
         self._has_maps = bool(own or episodes.targets or episodes.params)
-        self._given = params
+        self._overrides = params
         self._params = self.program.simulator.parameters(params_of(episodes, params) or {}, worlds)
         self._inputs = inputs = self.native.inputs(self._params, worlds)
         if self.filled is None or len(self.filled) != worlds:
@@ -341,7 +341,7 @@ class Stepper(Plan):
         if self.episodes.params:
             for name, drawn in self.episodes.params.items():
                 drawn[rows] = self._ahead.params[name][places]
-            for name, value in (params_of(self.episodes, self._given) or {}).items():
+            for name, value in (params_of(self.episodes, self._overrides) or {}).items():
                 self._params[name].copy_(value)
             own_params = {name: value[rows] for name, value in self._params.items()}
             layout = self.native.layout

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -100,7 +100,7 @@ class TaskProgram:
         """The numbers of actions that the goal reads."""
         self.hands = Hands(simulator, task.agent, task.size, counts="painted" in self._asked)
         self.laws = Laws(task, simulator)
-        """What observations can tell of the rules."""
+        """The laws that observations can show."""
         self.action_nvec = task.agent.action_nvec
         """How many values x, y, choice, vx and vy have. `Task.agent.choices` says what a choice means."""
 
@@ -112,7 +112,7 @@ class TaskProgram:
 
     @property
     def is_mixed(self) -> bool:
-        """Whether worlds run under different rulesets, so that this program cannot run them."""
+        """True where worlds run under different rulesets: this program cannot run them, those of `under` can."""
         return len(self.rulesets) > 0 and self.ruleset is None
 
     def ruleset_of(self, worlds: Tensor) -> Tensor:
@@ -132,6 +132,12 @@ class TaskProgram:
                 simulator = simulator.of(task.ruleset)
             self._under[number] = TaskProgram(task, self.split, simulator, ruleset=number)
         return self._under[number]
+
+    def apart(self, worlds: Tensor) -> Iterator[tuple[Tensor, TaskProgram]]:
+        """Yield the places of the worlds under each ruleset, int64 [n], and the program of that ruleset."""
+        rulesets = self.ruleset_of(worlds)
+        for number in rulesets.unique().tolist():
+            yield (rulesets == number).nonzero()[:, 0], self.under(number)
 
     # Beginning
 
@@ -293,8 +299,8 @@ class TaskProgram:
         after = replace(episodes, world=world, acted=acted, failed=failed, before=now)
         return after, reward.float(), success, over
 
-    def told(self, episodes: Episodes) -> Tensor:
-        """The laws that observations of episodes tell, uint8 [B, n]: see `Laws`."""
+    def law_bytes(self, episodes: Episodes) -> Tensor:
+        """Return the laws that observations of episodes show, uint8 [B, n]: see `Laws`."""
         return self.laws.of(episodes.params, len(episodes)).to(episodes.seed.device)
 
     @property

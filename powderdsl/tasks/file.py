@@ -63,7 +63,7 @@ class EndDecl(Record, noun="an end"):
 
 
 class Laws(Record):
-    """What rules worlds run under."""
+    """The rules that worlds run under."""
 
     params: tuple[tuple[Scalar, Scalar], ...] = keyed(
         "other values for the rules' parameters; of a range, such as `1%..20%`, each world draws its own",

@@ -1,4 +1,4 @@
-"""What can be told of the laws that worlds run under: outcomes of small experiments, and the parameters that worlds draw."""
+"""A description of the laws that worlds run under: outcomes of small experiments, and the parameters that worlds draw."""
 
 from __future__ import annotations
 

@@ -63,7 +63,7 @@ class MixedEpisodes:
         return MixedWorld([env.episodes.world for env in self._envs if env.episodes], self._rows)
 
     def joined(self, read: Callable[[TaskProgram, Episodes], Tensor]) -> Tensor:
-        """What a function makes of the episodes of each program: [B, …]."""
+        """Apply a function to the episodes of each program, and join the results: [B, …]."""
         return joined([read(env.program, env.episodes) for env in self._envs if env.episodes], self._rows)
 
 

@@ -252,7 +252,7 @@ class Expert:
 
 @dataclass(frozen=True)
 class Origin:
-    """What a task was read from: to read it again under other rules."""
+    """The file and the settings that a task was read from, to read it again under other rules."""
 
     source: Source
     knobs: Mapping[str, int]
@@ -289,7 +289,7 @@ class Task:
         return replace(self, goal=goal, origin=self.origin and replace(self.origin, shaped=True))
 
     def is_held_out(self, split: Split) -> bool:
-        """Whether no world of a split has the rules, or the value of some parameter, of a world of `train`."""
+        """Return whether all worlds of a split have rules, or a value of some parameter, that no world of `train` has."""
         train = self.split("train")
         if split.rulesets and not {*split.rulesets} & ({*train.rulesets} or {self.rules}):
             return True

@@ -1,4 +1,4 @@
-"""Whether a universe is lawful: what checking it, proving its claims and running it for a while show."""
+"""Filters of universes: results of checking a universe, proving its claims and running it for a while."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ MOST = 0.5
 
 @dataclass(frozen=True)
 class Findings:
-    """What was found out about a universe: diagnostics, claims that are proven or not, and what some worlds did.
+    """The findings about a universe: diagnostics, claims that are proven or not, and what some worlds did.
 
     `moved` cells change in the first step, and `reacted` hold another element in the end than moving explains. The element
     that gained most is `largest`, with its share of all cells.

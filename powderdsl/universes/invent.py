@@ -75,7 +75,7 @@ class Draws:
 
 @dataclass
 class Universe:
-    """What has been drawn of a universe so far."""
+    """A universe as far as it has been drawn."""
 
     draws: Draws
     pieces: Pieces
@@ -124,9 +124,9 @@ class Universe:
         lines: list[str] = []
         for line in self.pieces[piece].splitlines():
             alone = PLACE.fullmatch(line.strip())
-            if alone and isinstance(found := values[alone[1]], list):
+            if alone and isinstance(inserted := values[alone[1]], list):
                 indent = " " * (len(line) - len(line.lstrip()))
-                lines += [indent + inner if inner else inner for inner in found]
+                lines += [indent + inner if inner else inner for inner in inserted]
             else:
                 lines.append(PLACE.sub(lambda match: str(values[match[1]]), line))
         return lines
@@ -215,10 +215,10 @@ def universe_text(seed: int) -> str:
             name = draws.pick(group["laws"])
             universe.law(laws["laws"][name], name)
     levels = {part: level for part, level in universe.levels.items() if level}
-    sets = {
+    sets = [
         ", ".join(universe.names[part] for part, level in levels.items() if level >= least)
-        for least in levels.values()
-    }
+        for least in sorted({*levels.values()}, reverse=True)
+    ]
     lines = universe.block(
         "pack",
         seed=str(seed),
@@ -227,6 +227,6 @@ def universe_text(seed: int) -> str:
         tags=[f'{tag}: "{about}"' for tag, about in (laws["tags"] | laws["also_tagged"]).items()],
         elements=elements,
         passes=[line for pass_ in universe.passes.values() for line in pass_],
-        invariants=[line for held in sorted(sets, key=len) for line in universe.block("invariant", set=held)],
+        invariants=[line for held in sets for line in universe.block("invariant", set=held)],
     )
     return "\n".join(lines) + "\n"

@@ -42,7 +42,7 @@ class DataConfig(Checked):
     )
     steps: int = setting(8, low=1)
     pairs: int = setting(16, low=1)
-    rulesets: int = setting(0, "Only so many rulesets of the split; 0: all.", 0, 4096)
+    rulesets: int = setting(0, "Use only the first rulesets of the split, this many; 0: all.", 0, 4096)
     capacity: int = setting(1024 * 256, "Capacity of the buffer, in pairs.", 1, 1 << 32, option="buffer")
     refresh: int = setting(256, "Pairs that each iteration replaces in the buffer.", 1, 1 << 20)
 

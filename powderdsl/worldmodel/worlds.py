@@ -125,12 +125,7 @@ class TaskWorlds:
 
     def start(self, seeds: Tensor) -> Batch:
         """The worlds of seeds, int64 [B]."""
-        rulesets = self._program.ruleset_of(seeds)
-        parts = []
-        for ruleset in rulesets.unique().tolist():
-            numbers = (rulesets == ruleset).nonzero()[:, 0]
-            parts.append((numbers, self._program.under(ruleset).start(seeds[numbers])))
-        return Batch(tuple(parts))
+        return Batch(tuple((places, own.start(seeds[places])) for places, own in self._program.apart(seeds)))
 
     def later(self, world: Batch, steps: int) -> Batch:
         def stepped(episodes: Episodes) -> Episodes:

@@ -42,6 +42,6 @@ def command(seed: int, out: Path | None, about: bool, quick: bool) -> int:
         return OK
     from powderdsl.testing.lawful import findings
 
-    found = findings(seed)
-    click.echo("\n".join(found.lines), err=True)
-    return FAILED if found.faults else OK
+    results = findings(seed)
+    click.echo("\n".join(results.lines), err=True)
+    return FAILED if results.faults else OK

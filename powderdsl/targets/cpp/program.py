@@ -180,7 +180,7 @@ class PackedState(OwnedBatch):
         return taken
 
     def missed(self, goals: Tensor) -> Tensor:
-        """How many cells of contiguous goals, uint8 [B, H, W], have their element neither there nor beside it: int64 [B]."""
+        """Count the cells of contiguous goals, uint8 [B, H, W], whose element is neither there nor beside it: int64 [B]."""
         counts, (slot, bits, _) = torch.empty(len(goals), dtype=torch.int64), self.program.homes["element"]
         self.program.library.pd_missed(self.handle, slot, bits, goals.data_ptr(), counts.data_ptr())
         return counts

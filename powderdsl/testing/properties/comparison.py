@@ -217,9 +217,9 @@ def distinguish(
             small, steps = shrink_while(partial(when, {}), small, steps, tries, work)
         if not streams:
             small = replace(small, seed=np.zeros_like(small.seed))
-        one, other = (ran[-1] for ran in states(draws, small, steps))
-        slot = next(name for name in compared if (one[name] != other[name]).any())
-        return Distinction(small, steps, slot, one, other, draws)
+        end, other_end = (ran[-1] for ran in states(draws, small, steps))
+        slot = next(name for name in compared if (end[name] != other_end[name]).any())
+        return Distinction(small, steps, slot, end, other_end, draws)
     return None
 
 
