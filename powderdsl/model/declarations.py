@@ -225,6 +225,9 @@ class TestDecl(Entry, noun="a test"):
         (),
         maps="fields to drawings",
     )
+    params: tuple[Pair, ...] = keyed(
+        "values of parameters in this test alone", (), maps="parameters to values"
+    )
     steps: int = keyed("how many steps it runs: `50 steps`", 1, name="after", shape="text", form=STEPS)
     expect: Scalar | None = keyed("what the world looks like then; `?` matches anything", shape="text")
     expect_fields: tuple[tuple[Scalar, Scalar], ...] = keyed(

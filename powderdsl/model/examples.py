@@ -148,6 +148,7 @@ class _ExampleReader:
         ids |= {character: elements[meaning].id for character, meaning in self.legend.items()}
         fields = self._grids(decl.fields, ids, size, expected=False)
         expect_fields = self._grids(decl.expect_fields, ids, size, expected=True)
+        params = self._params()
         if not (decl.expect or decl.expect_fields or decl.always or decl.often):
             label = "`expect`, `expect_fields`, `always` or `often` is missing"
             raise typer.fail("PD109", f"the test `{name}` checks nothing", place, label)
@@ -165,7 +166,7 @@ class _ExampleReader:
             )
         drawn = set("".join((*given, *(expect or ()))))
         words = sorted(meaning for character, meaning in self.legend.items() if character in drawn)
-        words += [grid.name for grid in (*fields, *expect_fields)]
+        words += [*(grid.name for grid in (*fields, *expect_fields)), *params]
         for syntax in (*decl.always, *(change for change, _ in decl.often)):
             words += words_of(syntax)
         return Example(
@@ -181,8 +182,25 @@ class _ExampleReader:
             fields,
             expect_fields,
             tuple(often),
+            tuple(params.items()),
             self.composition.scope(self.pack, words),
         )
+
+    def _params(self) -> dict[str, float]:
+        """The parameters that the test sets, by qualified name."""
+        known, values = self.composition.params, {}
+        for key, syntax in self.decl.params:
+            param = known.get(key.word) or known.get(f"{self.pack}.{key.word}")
+            if param is not None:
+                values[param.name] = float(self.typer.constant(syntax, param.kind, Scope("", {})))  # type: ignore[arg-type]  # no kind of parameters has pairs
+                continue
+            if self.composition.is_declared(key.word, self.pack):
+                raise Poisoned  # what is wrong with its declaration has been reported
+            if key.is_optional:
+                raise Unresolved(key.word)
+            report_unknown("parameter", key, known, self.typer.reporter, "PD309")
+            raise Poisoned
+        return values
 
     def _legend(self) -> dict[str, str]:
         """The elements, by global name, that the characters of a test stand for."""

@@ -376,6 +376,8 @@ class Example:
     """Values that the start world has beside its elements."""
     expect_fields: tuple[FieldGrid, ...] = ()
     often: tuple[Often, ...] = ()
+    params: tuple[tuple[str, float], ...] = ()
+    """Values of parameters; all others have those of the rules."""
     scope: tuple[str, ...] = field(default=(), compare=False)
     """The packs that it is about. With other packs added its result may differ."""
 

@@ -88,9 +88,12 @@ def test_fields_are_drawn_where_elements_do_not_tell(tmp_path, old, new, drawn):
     assert not run_examples(load_text(FIELDS.replace(old, new) + body))[0].passed
 
 
-def test_no_test_is_written_for_a_world_with_other_parameters():
+def test_a_world_with_other_parameters_is_a_test_that_sets_them():
     forest = Original.of("forest_fire")
-    verdicts = [judge(forest, mutant) for mutant in forest.mutants() if mutant.operator == "order"]
-    alive = [verdict for verdict in verdicts if verdict.status == "survived"]
-    assert alive
-    assert {(verdict.differs_in, verdict.test) for verdict in alive} == {("element", None)}
+    mutant = next(mutant for mutant in forest.mutants() if mutant.operator == "order")
+    verdict = judge(forest, mutant)
+    assert verdict.status == "survived"
+    assert "params: {forest_fire.growth: 50%, forest_fire.lightning: 0%}" in verdict.test.text
+    for text, passes in ((mutant.source.text, True), (mutant.text, False)):
+        results = run_examples(load_text(with_tests(Source("more.yaml", text), [verdict.test])))
+        assert results[-1].passed == passes

@@ -136,7 +136,7 @@ class Composition:
                     known += ruleset.members[author].members
                     break
         for word in words:
-            pack = self.names.pack(self.names.of(speaker, word))
+            pack = self.names.pack(self.names.of(speaker, word)) or word.rpartition(".")[0]  # of a parameter
             known += [pack] if pack else []
         reached = set[str]().union(*(self.names.needs.get(pack, (pack,)) for pack in known))
         return tuple(pack for pack in self.packs if pack in reached)

@@ -330,7 +330,7 @@ def _optional_names(value: object) -> Iterator[tuple[str, Span]]:
                 yield value.text.removesuffix("?"), value.span
             parts: Iterable[object] = value.children
         case TestDecl():  # in its worlds a `?` stands for anything
-            keys = tuple(key for key, _ in (*value.fields, *value.expect_fields))
+            keys = tuple(key for key, _ in (*value.fields, *value.expect_fields, *value.params))
             parts = (value.legend, value.always, value.often, keys)
         case RulesetDecl():
             parts = (value.matrix, value.invariants)

@@ -35,6 +35,7 @@ from powderdsl.model.check import check
 from powderdsl.model.composition.names import needs_of, with_stand_ins
 from powderdsl.model.declarations import PackDecl, RulesetDecl, read_file
 from powderdsl.model.definitions import set_params
+from powderdsl.model.text import show_value
 from powderdsl.model.types import Element, Example, Local, Ruleset, Symmetric
 from powderdsl.simulation.programs import starting_backend
 from powderdsl.simulation.simulator import Simulator, World, compile
@@ -205,9 +206,7 @@ def judge(original: Original, mutant: Mutant, seed: int = 0) -> Verdict:
         return Verdict("equivalent", "a proof") if comparison.status == "equal" else Verdict("survived")
     if failed := failed_test(original, sim, mutant.pack, quick=False):
         return failed
-    usual = {param.name: float(param.default) for param in original.ruleset.params}
-    sets = any(usual[name] != value for name, (value,) in distinction.sample.params.items())
-    shown = not (distinction.draws or sets)  # a test needs a seed, and sets no parameter
+    shown = not distinction.draws  # a test needs a seed
     test = written_test(mutant, distinction, original.sim, original.packs) if shown else None
     return Verdict("survived", differs_in=distinction.slot, test=test)
 
@@ -432,6 +431,15 @@ def written_test(
         if words:
             lines += ["    fields:"] if "    fields:" not in lines else []
             lines += [f"      {name}{maybe[name]}: |", *words]
+    values = {
+        param: distinction.sample.params.get(param.name, [param.default])[0] for param in ruleset.params
+    }
+    sets = [
+        f"{param.name}{'?' * (param.name.partition('.')[0] not in needed)}: {show_value(ruleset, param.kind, float(value))}"
+        for param, value in values.items()
+        if float(value) != float(param.default)
+    ]
+    lines += [f"    params: {{{', '.join(sets)}}}"] if sets else []
     lines.append(f"    after: {distinction.steps} step{'' if distinction.steps == 1 else 's'}")
     if distinction.slot == "element":
         lines += ["    expect: |", *_drawn(wanted, glyphs)]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from math import ceil, log, prod
 from typing import TYPE_CHECKING, Any
@@ -12,7 +12,7 @@ from powderdsl.model import reference
 from powderdsl.model.check import select_packs, without_pack
 from powderdsl.model.examples import direction_word
 from powderdsl.model.text import one_line, show_number, show_single, show_value
-from powderdsl.model.types import Cell, Example, Expr, FieldGrid, Kind, Often, Ruleset
+from powderdsl.model.types import Cell, Example, Expr, FieldGrid, Kind, Ruleset
 from powderdsl.simulation.programs import starting_backend
 from powderdsl.simulation.simulator import compile
 from powderdsl.testing.generators.cases import holding
@@ -125,10 +125,10 @@ def _result(example: Example, sim: Simulator, seen: Callable[[Any], None] | None
     """Run a test with its own seed, or with all SEEDS."""
     seeds = SEEDS if example.seed is None else (example.seed,)
     world = start = start_of(example, sim, *seeds)
-    result = ExampleResult(example)
+    result, params = ExampleResult(example), dict(example.params)
     now = 0
     for stop in (*(range(1, example.steps) if example.always else ()), example.steps):
-        world = sim.step(world, steps=stop - now)
+        world = sim.step(world, steps=stop - now, params=params)
         now = stop
         problem = next(_problems(example, world, stop), None)
         if problem is not None:
@@ -141,7 +141,7 @@ def _result(example: Example, sim: Simulator, seen: Callable[[Any], None] | None
         seen(world)
     if example.often and result.passed:
         first = start.select(slice(0, 1))
-        words = chance_problem(first, example.steps, example.often, seeds[0])
+        words = chance_problem(first, example, seeds[0])
         result = ExampleResult(example, words, seeds[0], example.steps) if words else result
     return result
 
@@ -149,7 +149,7 @@ def _result(example: Example, sim: Simulator, seen: Callable[[Any], None] | None
 def _problems(example: Example, world: World, step: int) -> Iterator[tuple[int, str, str]]:
     """The world that is wrong after a step, how, and the field that is not as expected, if one is."""
     for condition in example.always if step else ():
-        fails = ~reference.evaluate(condition, world_context(world, condition))
+        fails = ~reference.evaluate(condition, world_context(world, example, condition))
         if fails.any():
             index, row, column = (int(part[0]) for part in np.nonzero(fails))
             words = one_line(condition.span) if condition.span else "a condition"
@@ -295,13 +295,15 @@ def trials_for(chance: float) -> int:
     return max(needed)
 
 
-def chance_problem(start: World, steps: int, claims: Sequence[Often], seed: int) -> str:
-    """A sentence about the first claim that counts contradict, or nothing.
+def chance_problem(start: World, example: Example, seed: int) -> str:
+    """A sentence about the first claim of a test that counts contradict, or nothing.
 
     All copies of the one world `start` have the same seed, and each an index of its own.
     """
+    steps, claims = example.steps, example.often
     chosen = [
-        (claim, reference.evaluate(claim.before, world_context(start, claim.before))[0]) for claim in claims
+        (claim, reference.evaluate(claim.before, world_context(start, example, claim.before))[0])
+        for claim in claims
     ]
     for claim, cells in chosen:
         if not cells.any():
@@ -315,8 +317,8 @@ def chance_problem(start: World, steps: int, claims: Sequence[Often], seed: int)
         index = [*range(first, min(first + chunk, copies))]  # by which each copy has luck of its own
         world = start.select(put([0] * len(index), "int64"))
         world = replace(world, index=put(index, "int64"), seed=put([seed] * len(index), "int64"))
-        world = world.sim.step(world, steps=steps)
-        at = world_context(world, *(claim.after for claim in claims))
+        world = world.sim.step(world, steps=steps, params=dict(example.params))
+        at = world_context(world, example, *(claim.after for claim in claims))
         for number, (claim, cells) in enumerate(chosen):
             hits[number] += int(reference.evaluate(claim.after, at)[:, cells].sum())
     for (claim, cells), hits_of_claim in zip(chosen, hits, strict=True):
@@ -329,8 +331,8 @@ def chance_problem(start: World, steps: int, claims: Sequence[Often], seed: int)
     return ""
 
 
-def world_context(world: World, *conditions: Expr) -> reference.Context:
-    """The values that some conditions read: a world's state as the oracle holds it, parameters, the clock."""
+def world_context(world: World, example: Example, *conditions: Expr) -> reference.Context:
+    """The values that conditions of a test read: a world's state as the oracle holds it, parameters, the clock."""
     ruleset, to_numpy = world.sim.ruleset, world.sim.kind.to_numpy
     read = {
         part.value
@@ -341,4 +343,5 @@ def world_context(world: World, *conditions: Expr) -> reference.Context:
     names = [name for name in world.state if name == "element" or name in read]
     state = reference.widen(ruleset, {name: to_numpy(world.state[name]) for name in names})
     clock = reference.Clock(to_numpy(world.seed), to_numpy(world.index), to_numpy(world.step))
-    return reference.Context(ruleset, state, reference.parameters(ruleset, len(world), {}), {}, clock)
+    params = reference.parameters(ruleset, len(world), dict(example.params))
+    return reference.Context(ruleset, state, params, {}, clock)

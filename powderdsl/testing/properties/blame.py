@@ -108,7 +108,8 @@ def difference_of_test(result: ExampleResult, runner: Runner) -> Difference | No
     if not result.added:
         return None
     ruleset, example, sim = runner.ruleset, result.example, runner.sim
-    world = sim.step(start_of(example, sim, result.seed), steps=max(result.step, 1))
+    start, steps = start_of(example, sim, result.seed), max(result.step, 1)
+    world = sim.step(start, steps=steps, params=dict(example.params))
     causes = _rules(ruleset, _lines_that_happened(ruleset, world.state), result.added)
     drawn = {char for rows in (example.given, example.expect or (), result.after) for char in "".join(rows)}
     near = frozenset(name for char, name in example.legend if char in drawn)
