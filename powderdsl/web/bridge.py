@@ -71,21 +71,22 @@ class Session:
     def check(self, files: Mapping[str, str], off: list[str]) -> dict[str, Any]:
         """Load the files without the packs in `off`. If they have mistakes, the previous rules stay.
 
-        Diagnostics have the text that `check` prints.
+        Diagnostics have the text that `check` prints. `texts` are loaded packs that ship and are not among the files.
         """
         selection = self._write(files, off)
         names = [str(self.folder / word) for word in selection.words]
         names[-1] = "-".join([names[-1], *selection.off])
-        packs: list[str] = []
+        packs: dict[str, str] = {}
         answer: dict[str, Any] = {"ok": True}
         try:
-            packs = [Path(pack.source.name).name for pack in read(names, Reporter())[0]]
+            packs = {Path(pack.source.name).name: pack.source.text for pack in read(names, Reporter())[0]}
             self.ruleset, remarks = load_with_diagnostics(*names)
             self.good, answer["words"] = selection, _words(self.ruleset)
         except CompileError as error:
             answer["ok"], remarks = False, error.diagnostics
         data = [diagnostic_data(remark, utf16=True) | {"text": render_text(remark)} for remark in remarks]
-        return answer | {"diagnostics": data, "packs": packs}
+        texts = {name: text for name, text in packs.items() if name not in files and NAME.fullmatch(name)}
+        return answer | {"diagnostics": data, "packs": list(packs), "texts": texts}
 
     def _write(self, files: Mapping[str, str], off: list[str]) -> Selection:
         """Write the files, and select the names for `load`: rulesets, and packs that no ruleset lists."""
@@ -310,4 +311,7 @@ def call(name: str, arguments: str) -> str | bytes:
     if isinstance(answer.get("result"), bytes):
         return bytes(answer["result"])
     # Texts mention files by the page's names, without the folder.
-    return json.dumps(answer).replace(json.dumps(f"{current.folder}/")[1:-1], "")
+    text = json.dumps(answer)
+    for folder in (current.folder, current.folder.parent):
+        text = text.replace(json.dumps(f"{folder}/")[1:-1], "")
+    return text

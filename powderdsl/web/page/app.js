@@ -1,23 +1,12 @@
 // Puts the parts of the page together: keys, buttons, and the order in which things load.
 
-import { $, failed, fill, get } from "./dom.js";
+import { $, failed, get } from "./dom.js";
 import { addWorlds, chooseRules, openRules, resize, startWorld } from "./opening.js";
 import { layout, newPainter, refresh, setRunning } from "./stage.js";
 import { app } from "./state.js";
 import { arrows, showPanel } from "./tabs.js";
-import {
-  SPEEDS,
-  choose,
-  redo,
-  reset,
-  setBrush,
-  setSpeed,
-  setTool,
-  showComponents,
-  showElements,
-  stepOnce,
-  undo,
-} from "./tools.js";
+import { SPEEDS, choose, reset, setBrush, setSpeed, setTool, showComponents, showElements, stepOnce } from "./tools.js";
+import { redo, undo } from "./work.js";
 
 const KEYS = {
   " ": () => setRunning(!app.running),
@@ -43,7 +32,8 @@ function key(event) {
     return;
   }
   if (command || event.altKey) return;
-  if (event.key === " " && target.closest?.("button")) return;
+  // Space presses the button that has the focus, unless that is chosen already, such as an element.
+  if (event.key === " " && target.closest?.("button:not([aria-checked=true], [aria-selected=true])")) return;
   if (/^[1-9]$/.test(event.key)) choose(app.engine.elements[Number(event.key) - 1]);
   else if (Object.hasOwn(KEYS, event.key)) KEYS[event.key]();
   else return;
@@ -84,7 +74,6 @@ async function begin() {
   setSpeed(SPEEDS.indexOf(app.speed));
   showPanel("rules-panel");
   app.catalog = await (await get("catalog.json")).json();
-  fill($("rules"), app.catalog.rules.map((one) => [one.key, one.key]), app.catalog.rules[0].key);
   const [first] = app.catalog.rules;
   await openRules(first.key, { size: first.sizes[0].join("x") });
   app.firstWorld = performance.now();

@@ -16,6 +16,9 @@ export class Compiler {
     this.open = new Map();
     /** The last files that were sent, so that a fresh worker knows them. */
     this.files = null;
+    /** The files of the last check, if they were without mistakes. */
+    this.holds = null;
+    this.checks = 0;
     this._start();
   }
 
@@ -76,6 +79,7 @@ export class Compiler {
       reject(new CompileFailure(reason));
     }
     this._start();
+    this.holds = this.files?.[0] ?? null;
     if (this.files) this.call("check", ...this.files).catch(() => {});
   }
 
@@ -92,8 +96,11 @@ export class Compiler {
   }
 
   async check(files, off) {
+    this.holds = null;
+    const mine = ++this.checks;
     const found = await this.call("check", files, off);
     if (found.ok) this.files = [files, off];
+    if (found.ok && mine === this.checks) this.holds = files;
     return found;
   }
 }

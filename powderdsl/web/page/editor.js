@@ -157,6 +157,18 @@ export class Editor {
     this.states.set(name, this._state(text));
   }
 
+  /** The state of a file under another name. */
+  rename(name, fresh) {
+    this.states.set(fresh, name === this.name ? this.view.state : this.states.get(name));
+    this.states.delete(name);
+    if (name === this.name) this.name = fresh;
+  }
+
+  remove(name) {
+    if (name === this.name) this.name = "";
+    this.states.delete(name);
+  }
+
   show(name) {
     if (this.name) this.states.set(this.name, this.view.state);
     this.name = name;

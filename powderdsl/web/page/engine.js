@@ -164,6 +164,22 @@ export class Engine {
     return [...lost];
   }
 
+  /**
+   * Continues a world of another size. If it has an edge of the element `frame`, that edge moves to the new one.
+   * @param {Snapshot} from @param {number | null} frame
+   */
+  fit(from, frame) {
+    const edge = [...edgeOf(from)];
+    const isFramed = frame !== null && edge.every((at) => from.ids[at] === frame);
+    const ids = from.ids.slice();
+    if (isFramed) for (const at of edge) ids[at] = this.ground;
+    this.restore({ ...from, ids });
+    if (!isFramed) return;
+    const mask = new Uint8Array(this.cells);
+    for (const at of edgeOf(this)) mask[at] = 1;
+    this.paint(frame, mask);
+  }
+
   /** A function that calls its argument with each pair of places: of a cell here, and of the same cell there. */
   _placing({ rows, columns }) {
     const down = this.rows - rows;
@@ -222,7 +238,7 @@ function grown(from, down, right, source) {
   return { ...from, rows, columns, ids: grow(from.ids, 1), fields };
 }
 
-/** Snapshots before edits, so that they can be undone: as many as fit into some memory. */
+/** Moments before changes, so that they can be undone: as many as fit into some memory. */
 export class History {
   constructor(limit = 96 * 2 ** 20) {
     this.limit = limit;
@@ -230,26 +246,33 @@ export class History {
   }
 
   clear() {
-    /** @type {Snapshot[]} */ this.past = [];
-    /** @type {Snapshot[]} */ this.future = [];
+    /** @type {import("./work.js").Moment[]} */ this.past = [];
+    /** @type {import("./work.js").Moment[]} */ this.future = [];
   }
 
-  /** Remembers a world that is about to be edited. */
-  keep(snapshot) {
-    this.past.push(snapshot);
+  /** Remembers what is about to change. */
+  keep(moment) {
+    this.past.push(moment);
     this.future = [];
     let size = 0;
     let kept = 0;
-    for (const one of [...this.past].reverse()) {
-      size += one.ids.byteLength;
-      for (const { values } of one.fields.values()) size += values.byteLength;
+    let before = null;
+    for (const { module, world } of [...this.past].reverse()) {
+      size += world.ids.byteLength + (module === before ? 0 : MODULE);
+      for (const { values } of world.fields.values()) size += values.byteLength;
+      before = module;
       if (size > this.limit && kept) break;
       kept++;
     }
     this.past = this.past.slice(-kept);
   }
 
-  /** The world before the last edit, in exchange for the present one. */
+  /** The moment that undo or redo leads to. */
+  next(way) {
+    return (way === "undo" ? this.past : this.future).at(-1);
+  }
+
+  /** The moment before the last change, in exchange for the present one. */
   undo(present) {
     const found = this.past.pop();
     if (found) this.future.push(present);
@@ -263,14 +286,16 @@ export class History {
   }
 }
 
+const MODULE = 2 ** 20; // bytes, more or less, of a compiled module
+
 /**
- * Shapes at random places, other ones for each seed: 24 disks, boxes and lines of all elements, framed if the rules move
+ * Shapes at random places, other ones for each seed (a bigint): 24 disks, boxes and lines of all elements, framed if the rules move
  * anything.
  */
 export function scatter(engine, frame, seed) {
   const { rows, columns, elements } = engine;
   const ids = new Uint8Array(rows * columns).fill(engine.ground);
-  const random = generator(seed);
+  const random = generator(Number(seed & 0xffffffffn) ^ Number(seed >> 32n));
   const below = (n) => Math.floor(random() * n);
   const reach = Math.max(2, Math.floor(Math.min(rows, columns) / 8));
   for (let n = 0; n < 24 && elements.length > 1; n++) {
@@ -289,13 +314,16 @@ export function scatter(engine, frame, seed) {
   return framed(ids, engine, frame);
 }
 
+/** The places of the cells at the edge. */
+function* edgeOf({ rows, columns }) {
+  for (let y = 0; y < rows; y++)
+    for (let x = 0; x < columns; x += y % (rows - 1) && columns > 1 ? columns - 1 : 1) yield y * columns + x;
+}
+
 /** Ids with an edge of the element `frame`, so that nothing falls out; null for rules that need none. */
 export function framed(ids, { rows, columns }, frame) {
   if (frame === null) return ids;
-  for (let i = 0; i < ids.length; i++) {
-    const [y, x] = [Math.floor(i / columns), i % columns];
-    if (y === 0 || x === 0 || y === rows - 1 || x === columns - 1) ids[i] = frame;
-  }
+  for (const at of edgeOf({ rows, columns })) ids[at] = frame;
   return ids;
 }
 

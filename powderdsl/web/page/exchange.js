@@ -2,24 +2,19 @@
 
 import { $, commandLine, failed, make, say } from "./dom.js";
 import { Recorder, download, gif, png } from "./media.js";
-import { openRules, openWorld } from "./opening.js";
-import { addFile, applyRules, openFiles, rules } from "./rules.js";
+import { openWork, openWorld } from "./opening.js";
+import { addFile, addRuleset, isRuleset, rules } from "./rules.js";
 import { fromFragment, toFragment } from "./share.js";
-import { refresh } from "./stage.js";
+import { listedRules, sheetOf } from "./shipped.js";
 import { app } from "./state.js";
 import { missing, webm } from "./video.js";
+import { changedParameters } from "./work.js";
 import { readWorld, text, writeWorld } from "./worlds.js";
 
 const MAX_FILE = 32 << 20;
 const recorder = new Recorder();
 app.drawn = (image) => recorder.add(image);
 app.recorder = recorder;
-
-/** Parameters whose values are not those of the files. */
-function changedParameters() {
-  const { parameters, values } = app.engine;
-  return Object.fromEntries(parameters.flatMap((one, i) => (values[i] === one.value ? [] : [[one.name, values[i]]])));
-}
 
 /** The files that differ from the site's; null for a file of the site that is gone. */
 function changedFiles() {
@@ -36,7 +31,7 @@ export async function link() {
     key: app.rules.key,
     files: changedFiles(),
     off: [...rules.off],
-    parameters: Object.fromEntries(app.engine.parameters.map((one, i) => [one.name, app.engine.values[i]])),
+    parameters: changedParameters(),
     world: app.engine.snapshot(),
   };
   return location.href.split("#")[0] + (await toFragment(shared));
@@ -53,34 +48,15 @@ async function share() {
   }
 }
 
-/** Opens what a link holds. A world of edited rules waits until they are compiled. */
+/** Opens what a link holds. */
 export async function openLink(fragment) {
   const shared = await fromFragment(fragment);
   if (!shared) return false;
-  const { world, files, off, parameters } = shared;
-  const listed = app.catalog.rules.find((one) => one.key === shared.key);
-  if (!listed) throw new Error(`The link uses the rules ${shared.key}, which this page does not have.`);
-  const size = `${world.rows}x${world.columns}`;
-  if (!(await openRules(shared.key, { size, run: false }))) return false;
-  const own = files === null && String(off) === String(app.rules.off);
-  if (!own || !listed.sizes.some((one) => one.join("x") === size)) {
-    say("Compiling the rules of the link…");
-    const all = { ...app.rules.files, ...files };
-    for (const name of Object.keys(all)) if (all[name] === null) delete all[name];
-    const found = await openFiles(all, off, Object.keys(files ?? {})[0]);
-    rules.edited = !own;
-    if (!found?.ok) throw new Error("The rules of the link have mistakes: see the list below the editor.");
-    await applyRules(world.rows, world.columns);
-  }
-  app.engine.parameters.forEach(({ name }, i) => {
-    if (Object.hasOwn(parameters, name)) app.engine.setParameter(i, parameters[name]);
-  });
-  for (const one of app.onEngine) one(app.engine);
-  openWorld(world);
-  app.history.clear();
-  refresh();
-  say("This is the world of the link, paused.");
-  return true;
+  const { files: changed, key } = shared;
+  if (!listedRules(key)) throw new Error(`The link uses the rules ${key}, which this page does not have.`);
+  const files = changed && { ...(await sheetOf(key)).files, ...changed };
+  for (const name of Object.keys(files ?? {})) if (files[name] === null) delete files[name];
+  return openWork({ ...shared, files }, { words: "This is the world of the link, paused." });
 }
 
 async function saveWorld() {
@@ -122,20 +98,30 @@ async function saveFilm(make, name) {
   say(`${name} is saved.`);
 }
 
-async function openFile(file) {
-  if (!file) return;
-  if (file.size > MAX_FILE) throw new Error(`${file.name} is larger than ${MAX_FILE >> 20} MiB.`);
-  if (/\.ya?ml$/i.test(file.name)) {
-    const name = file.name.replace(/\.yml$/i, ".yaml");
-    if (!/^[A-Za-z0-9_][A-Za-z0-9_-]{0,60}\.yaml$/.test(name)) throw new Error(`${file.name}: rename it to letters, digits, _ and -`);
-    addFile(name, await file.text());
-    return;
+/** Opens files that were dropped or chosen, together. */
+async function openAll(list) {
+  const texts = {};
+  const worlds = [];
+  for (const file of list) {
+    if (file.size > MAX_FILE) throw new Error(`${file.name} is larger than ${MAX_FILE >> 20} MiB.`);
+    if (!/\.ya?ml$/i.test(file.name)) worlds.push(file);
+    else texts[fileName(file.name)] = await file.text();
   }
+  if (Object.values(texts).some(isRuleset)) addRuleset(texts);
+  else for (const [name, text] of Object.entries(texts)) addFile(name, text);
+  for (const file of worlds) await openNpz(file);
+}
+
+function fileName(given) {
+  const name = given.replace(/\.ya?ml$/i, ".yaml");
+  if (!/^[A-Za-z0-9_][A-Za-z0-9_-]{0,60}\.yaml$/.test(name)) throw new Error(`${given}: rename it to letters, digits, _ and -`);
+  return name;
+}
+
+async function openNpz(file) {
   const data = new Uint8Array(await file.arrayBuffer());
   const world = readWorld(await rules.compiler.call("open_world", text(data)));
-  if (world.rows !== app.engine.rows || world.columns !== app.engine.columns) await applyRules(world.rows, world.columns);
-  openWorld(world);
-  say(`${file.name}: ${world.rows}×${world.columns} cells, step ${world.clock[2]}`);
+  if (await openWorld(world)) say(`${file.name}: ${world.rows}×${world.columns} cells, step ${world.clock[2]}`);
 }
 
 const on = (id, action) =>
@@ -166,13 +152,13 @@ missing().then((reason) => {
 });
 on("open", () => $("file").click());
 $("file").onchange = () => {
-  openFile($("file").files[0]).catch(failed);
+  openAll([...$("file").files]).catch(failed);
   $("file").value = "";
 };
 addEventListener("dragover", (event) => event.preventDefault());
 addEventListener("drop", (event) => {
   event.preventDefault();
-  openFile(event.dataTransfer?.files[0]).catch(failed);
+  openAll([...(event.dataTransfer?.files ?? [])]).catch(failed);
 });
 addEventListener("hashchange", () => openLink(location.hash).catch(failed));
 openLink(location.hash)

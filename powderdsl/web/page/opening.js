@@ -1,142 +1,180 @@
-// Rules and worlds of the site: fetches, opens and resizes them.
+// Worlds and rules that are opened: those of the site, of links and files, other sizes.
 
-import { $, failed, fill, get, say } from "./dom.js";
+import { $, failed, say } from "./dom.js";
 import { Engine, enlarged, framed, scatter, tiled } from "./engine.js";
 import { clearChart } from "./readings.js";
+import { hasModule, listedRules, moduleOf, sheetOf, shippedModule } from "./shipped.js";
 import { refresh, setRunning, use } from "./stage.js";
 import { app } from "./state.js";
-import { remember } from "./tools.js";
-import { readWorld } from "./worlds.js";
-
-const modules = new Map();
-
-/** The site's module of its own rules. */
-export function shippedModule(key, rows, columns) {
-  const path = `rules/${key}-${rows}x${columns}.wasm`;
-  if (!modules.has(path)) {
-    const found = get(path).then(async (answer) => WebAssembly.compile(await answer.arrayBuffer()));
-    found.catch(() => modules.delete(path));
-    modules.set(path, found);
-  }
-  return modules.get(path);
-}
-
-const sheets = new Map();
-export function sheetOf(key) {
-  if (!sheets.has(key)) sheets.set(key, get(`rules/${key}.json`).then((answer) => answer.json()));
-  return sheets.get(key);
-}
-
-const moduleOf = (rows, columns) =>
-  app.compiled ? app.compiled(rows, columns) : shippedModule(app.rules.key, rows, columns);
-
-export const size = () => $("size").value.split("x").map(Number);
-
-let openings = 0;
+import { isWork, newSitting, open, remember, showMenus, swap } from "./work.js";
+import { MAX_CLOCK, readWorld } from "./worlds.js";
 
 /** Opens rules of the site. Resolves to whether they are open. */
-export async function openRules(key, { world, size: wanted = "64x64", run = true } = {}) {
+export function openRules(key, { size: wanted = "64x64", run = true } = {}) {
   say(`Loading ${key}…`);
-  const mine = ++openings;
-  const listed = app.catalog.rules.find((one) => one.key === key);
-  const shape = listed.sizes.some((one) => one.join("x") === wanted) ? wanted : listed.sizes[0].join("x");
-  const [sheet, module] = await Promise.all([sheetOf(key), shippedModule(key, ...shape.split("x"))]);
-  const engine = await Engine.start(module);
-  if (mine !== openings) return false; // others were chosen meanwhile
-  // Packs are opened to paint with their own elements, the first of which is the ground in rules of one pack.
-  const own = engine.elements.find((one) => one.qualified.startsWith(`${key}.`) && one.id !== engine.ground);
-  if (own) app.element = own.qualified;
-  app.rules = sheet;
-  app.compiled = null;
-  $("rules").value = key;
-  fill($("size"), listed.sizes.map((one) => [one.join("x"), one.join("×")]), shape);
-  fillWorlds(world ?? sheet.shown);
-  app.keepParameters = false;
-  use(engine);
-  startWorld();
-  setRunning(run);
-  say(sheet.about || sheet.title);
-  for (const one of app.onRules) one(sheet);
-  return true;
+  return swap(async () => {
+    const sizes = listedRules(key).sizes;
+    const [rows, columns] = sizes.find((one) => one.join("x") === wanted) ?? sizes[0];
+    const [sheet, module] = await Promise.all([sheetOf(key), shippedModule(key, rows, columns)]);
+    const engine = await Engine.start(module);
+    return () => {
+      // Packs are opened to paint with their own elements, the first of which is the ground in rules of one pack.
+      const own = engine.elements.find((one) => one.qualified.startsWith(`${key}.`) && one.id !== engine.ground);
+      const named = { world: sheet.shown ?? "random", seed: app.named.seed };
+      begin(engine, sheet, named);
+      const world = engine.snapshot();
+      const fresh = { sheet, module, compiled: false, edits: null, parameters: {}, world, start: world, named, painted: false };
+      if (own) app.element = own.qualified;
+      const kept = land(fresh, engine);
+      setRunning(run);
+      say([sheet.about || sheet.title, kept].filter(Boolean).join(" "));
+    };
+  });
 }
 
-function fillWorlds(chosen) {
-  const names = app.rules.worlds.map((one) => [one.name, one.name.replace(/^task /, "task: ")]);
-  fill($("world"), [...names, ["random", "random shapes"], ["empty", "empty"]], chosen ?? "random");
+/** Opens a moment as another piece of work. Returns what became of the present one, in words. */
+function land(found, engine) {
+  const kept = app.engine !== null && isWork();
+  if (app.engine) remember();
+  if (kept) app.save?.();
+  const work = kept || !app.work ? newWork() : app.work;
+  open({ ...found, sitting: newSitting(), work }, engine);
+  return kept ? (app.save ? "Your earlier work is under Recent." : "Undo brings your earlier work back.") : "";
 }
 
-/** Opens other rules, unless the user wants to keep edits. */
-export function chooseRules(key) {
-  if (app.edits?.edited && !confirm("Open other rules, and lose your edits of these?")) {
-    $("rules").value = app.rules.key;
-    return;
-  }
-  openRules(key, { size: $("size").value }).catch(failed);
-}
+const newWork = () => `${Date.now().toString(36)}-${Math.random().toString(36).slice(2, 10)}`;
+
+export const chooseRules = (key) => openRules(key, { size: $("size").value }).catch(failed);
 
 /** Worlds of tasks, which come after the first world runs. @param {Record<string, any[]>} found  by rules */
 export async function addWorlds(found) {
-  for (const [key, worlds] of Object.entries(found)) {
-    if (!app.catalog.rules.some((one) => one.key === key)) continue;
-    const sheet = await sheetOf(key);
-    sheet.worlds.push(...worlds);
-    if (app.rules === sheet) fillWorlds($("world").value);
-  }
+  for (const [key, worlds] of Object.entries(found)) if (listedRules(key)) (await sheetOf(key)).worlds.push(...worlds);
+  showMenus();
+}
+
+/** The seed that is typed, as the command line takes it; null if it takes none such. */
+function typedSeed() {
+  const text = $("seed").value.trim();
+  const seed = /^\d{1,19}$/.test(text) ? BigInt(text) : Number.isSafeInteger(Number(text || NaN)) ? BigInt(Number(text)) : -1n;
+  return seed >= 0n && seed <= MAX_CLOCK ? String(seed) : null;
 }
 
 /** Begins the chosen world, with the chosen seed. */
 export function startWorld() {
-  const { engine } = app;
-  const seed = Number($("seed").value) >>> 0;
-  const name = $("world").value;
-  const listed = app.rules.worlds.find((one) => one.name === name);
-  if (listed) {
-    const world = readWorld(listed);
-    engine.restore(filling(world, engine));
-    if (!world.clock.some(Boolean)) engine.reseed(seed);
-  } else if (name === "empty") {
-    engine.begin(framed(new Uint8Array(engine.cells).fill(engine.ground), engine, app.rules.frame), seed);
-  } else {
-    engine.begin(scatter(engine, app.rules.frame, seed), seed);
+  const seed = typedSeed();
+  if (seed === null) {
+    showMenus();
+    say(`A seed is a whole number from 0 to ${MAX_CLOCK}: it is still ${app.named.seed}.`, true);
+    return;
   }
-  app.start = engine.snapshot();
-  app.history.clear();
-  app.checkpoints = [];
+  remember();
+  const named = { world: $("world").value, seed };
+  begin(app.engine, app.rules, named);
+  Object.assign(app, { start: app.engine.snapshot(), named, painted: !named.world });
   clearChart();
+  showMenus();
   refresh();
 }
 
+/** Begins a world in an engine. */
+function begin(engine, sheet, { world: name, seed }) {
+  const listed = sheet.worlds.find((one) => one.name === name);
+  if (listed) {
+    engine.restore(filling(readWorld(listed), sheet, engine));
+    if (engine.clock().some(Boolean)) return;
+  } else if (name === "") engine.restore(app.start);
+  else if (name === "empty") engine.begin(framed(new Uint8Array(engine.cells).fill(engine.ground), engine, sheet.frame), 0);
+  else engine.begin(scatter(engine, sheet.frame, BigInt(seed)), 0);
+  engine.reseed(BigInt(seed));
+}
+
 /** A start world that fills a larger one: patterns of cellular automata are repeated, where things move they grow. */
-function filling(world, { rows, columns }) {
+function filling(world, sheet, { rows, columns }) {
   const [down, right] = [Math.floor(rows / world.rows), Math.floor(columns / world.columns)];
   const factor = Math.min(down, right);
   if (factor < 1 || down * right === 1) return world;
-  return app.rules.frame === null ? tiled(world, down, right) : enlarged(world, factor);
+  return sheet.frame === null ? tiled(world, down, right) : enlarged(world, factor);
 }
 
 /** Continues with a world from elsewhere, which `reset` returns to. @param {import("./engine.js").Snapshot} world */
 export function openWorld(world) {
-  remember();
-  const lost = app.engine.restore(world);
-  app.start = app.engine.snapshot();
-  refresh();
-  return lost;
+  const { rows, columns } = world;
+  return swap(async () => {
+    const same = rows === app.engine.rows && columns === app.engine.columns;
+    const engine = same ? app.engine : await Engine.start(await moduleOf(rows, columns));
+    return () => {
+      remember();
+      app.keepParameters = true;
+      if (engine !== app.engine) use(engine);
+      engine.restore(world);
+      const named = { world: "", seed: String(world.clock[0]) };
+      Object.assign(app, { start: engine.snapshot(), named, painted: true });
+      refresh();
+    };
+  });
 }
 
-export async function resize() {
-  const before = app.engine.snapshot();
-  const [rows, columns] = size();
+/** Another size: a world that was painted keeps its cells, as far as they fit; any other one begins in the new size. */
+export function resize() {
+  const [rows, columns] = $("size").value.split("x").map(Number);
   say("Loading…");
-  try {
-    const module = await moduleOf(rows, columns);
-    app.keepParameters = true;
-    use(await Engine.start(module));
-  } catch (error) {
-    say(String(error.message ?? error), true);
-    $("size").value = `${before.rows}x${before.columns}`;
-    return;
-  }
-  if (["random", "empty"].includes($("world").value) || app.rules.worlds.some((one) => one.name === $("world").value))
-    startWorld();
-  say(`${rows}×${columns} cells`);
+  return swap(async () => {
+    const engine = await Engine.start(await moduleOf(rows, columns));
+    return () => {
+      remember();
+      const { named, painted, rules, start } = app;
+      const before = app.engine.snapshot();
+      app.keepParameters = true;
+      use(engine);
+      if (painted) engine.fit(start, rules.frame);
+      else begin(engine, rules, named);
+      app.start = engine.snapshot();
+      if (painted) engine.fit(before, rules.frame);
+      refresh();
+      const cut = painted && (rows < before.rows || columns < before.columns);
+      say(`${rows}×${columns} cells${cut ? "; what did not fit is cut, Undo brings it back" : ""}`);
+    };
+  }).catch(failed);
+}
+
+/**
+ * Opens the work of a link or a file, or one that the browser has kept: changed files are compiled, unless the module is
+ * there. Says `words` then. Resolves to whether it is open.
+ * @param {{key: string, sheet?: any, files: Record<string, string> | null, off: string[], good?: any, shown?: string,
+ *   module?: WebAssembly.Module, parameters: Record<string, number>, world: Snapshot, start?: Snapshot, named?: any}} found
+ */
+export function openWork(found, { words, run = false, work } = {}) {
+  const { files, key, off, parameters, world } = found;
+  const { rows, columns } = world;
+  const opened = swap(async () => {
+    const sheet = listedRules(key) ? await sheetOf(key) : found.sheet;
+    if (!sheet) throw new Error(`This page does not have the rules ${key}.`);
+    const edited = files !== null || String(off) !== String(sheet.off);
+    const own = { files: files ?? sheet.files, off };
+    const isShipped = !edited && hasModule(key, rows, columns);
+    let module = found.module ?? (isShipped ? await shippedModule(key, rows, columns) : null);
+    if (!module) {
+      say("Compiling the rules…");
+      const { compile } = await import("./rules.js");
+      module = await compile(found.good ?? own, rows, columns);
+    }
+    const good = found.good ?? own;
+    // Rules with mistakes and no earlier ones without: those of the site run, until the mistakes are gone.
+    const runs = module ?? (await shippedModule(key, ...listedRules(key).sizes[0]));
+    const engine = await Engine.start(runs);
+    return () => {
+      const shown = found.shown ?? Object.keys(files ?? {}).find((name) => files[name] !== sheet.files[name]);
+      const edits = edited ? { ...own, good: module ? good : sheet, shown, edited } : null;
+      const named = found.named ?? { world: "", seed: String(world.clock[0]) };
+      const compiled = edited && module !== null;
+      const start = found.start ?? world;
+      const kept = land({ sheet, module: runs, compiled, edits, parameters, world, start, named, painted: found.painted ?? true }, engine);
+      if (work) app.work = work;
+      setRunning(run);
+      if (module) say([words, kept].filter(Boolean).join(" "));
+      else say("The rules have mistakes: see the list below the editor.", true);
+    };
+  });
+  opened.catch(() => false).then((landed) => landed || app.edits?.recheck());
+  return opened;
 }

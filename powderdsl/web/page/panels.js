@@ -2,9 +2,11 @@
 
 import { $, make } from "./dom.js";
 import { Engine } from "./engine.js";
-import { chooseRules, sheetOf, shippedModule } from "./opening.js";
+import { chooseRules } from "./opening.js";
+import { sheetOf, shippedModule } from "./shipped.js";
 import { app } from "./state.js";
 import { Painter } from "./view.js";
+import { remember } from "./work.js";
 import { readWorld } from "./worlds.js";
 
 const LIVE_EVERY = 100; // ms between two steps of a picture
@@ -16,7 +18,11 @@ function showParameters(engine) {
     range.value = String(engine.values[number]);
     const word = (value) => (one.kind === "chance" ? `${Math.round(value * 1e5) / 1e3} %` : String(Math.round(value * 1e4) / 1e4));
     const output = make("output", {}, word(engine.values[number]));
+    let sliding = false; // one drag is one change to undo
+    range.onchange = () => (sliding = false);
     const set = (value) => {
+      if (!sliding) remember();
+      sliding = true;
       engine.setParameter(number, value);
       output.textContent = word(value);
     };
@@ -25,6 +31,7 @@ function showParameters(engine) {
     back.onclick = () => {
       range.value = String(one.value);
       set(one.value);
+      sliding = false;
     };
     return make("div", { class: "parameter" }, make("span", {}, one.name), make("span", {}, output, " ", back), range, make("small", {}, one.about ?? ""));
   });

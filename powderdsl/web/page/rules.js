@@ -7,16 +7,34 @@ import { Engine } from "./engine.js";
 import { refresh, use } from "./stage.js";
 import { app } from "./state.js";
 import { choose } from "./tools.js";
+import { remember, showMenus, swap } from "./work.js";
 
 const PAUSE = 120; // ms without a key before a check
-const packOf = (file) => file.replace(/\.ya?ml$/, "");
+export const packOf = (file) => file.replace(/\.ya?ml$/, "");
+export const isRuleset = (text) => /^ruleset:/m.test(text);
+const declared = (text) => /^pack: *([A-Za-z_]\w{0,60}) *(#.*)?$/m.exec(text)?.[1];
+
+/** Whether the same packs of the same files take part. */
+const alike = (a, b) =>
+  String(a.off) === String(b.off) &&
+  Object.keys(a.files).length === Object.keys(b.files).length &&
+  Object.keys(a.files).every((name) => a.files[name] === b.files[name]);
 
 export const rules = (app.edits = {
   /** @type {Record<string, string>} */ files: {},
   /** @type {Set<string>} names of packs that are off */ off: new Set(),
   shown: "",
+  /** The files that run: the last ones without mistakes. @type {{files: Record<string, string>, off: string[]}} */
+  good: null,
+  /** The pack that each file declares, as far as tabs know. @type {Record<string, string | undefined>} */ packs: {},
   /** @type {any[]} */ diagnostics: [],
-  /** Whether the files differ from those of the site. */ edited: false,
+  /** Whether the files differ from those of the site. */
+  get edited() {
+    return !alike(app.rules, { files: rules.files, off: [...rules.off] });
+  },
+  moment: () => ({ files: { ...rules.files }, off: [...rules.off], good: rules.good, shown: rules.shown, edited: rules.edited }),
+  exchange,
+  recheck,
   /** @type {Compiler} */ compiler: null,
   /** Functions that are called when other rules run. */ onApplied: [],
 });
@@ -35,17 +53,26 @@ rules.compiler = new Compiler((stage, error) => {
   if (error) say(error, true);
 });
 
-/** Opens the files of the site, or those of a link. Resolves to what the check finds. */
-export function openFiles(files, off = [], shown = undefined) {
+/** Opens files, of which `good` run. Resolves to what the check finds. */
+export function openFiles({ files, off = [], shown, good }) {
+  clearTimeout(waiting);
   rules.files = { ...files };
   rules.off = new Set(off);
-  rules.edited = false;
+  rules.good = good ?? { files, off };
   rules.diagnostics = [];
+  rules.packs = Object.fromEntries(Object.entries(files).map(([name, text]) => [name, declared(text)]));
   editor.open(rules.files);
   const names = Object.keys(files);
   const own = `${app.rules.key}.yaml`;
-  const wanted = [shown, own].find((name) => name && names.includes(name) && !/^ruleset:/m.test(files[name]));
+  const wanted = shown in files ? shown : names.includes(own) && !isRuleset(files[own]) ? own : null;
   show(wanted ?? names[2] ?? names.at(-1));
+  return recheck();
+}
+
+/** Has the compiler hold the files that run, whatever it was asked about meanwhile, and looks for mistakes again. */
+function recheck() {
+  const { files, off } = rules.good;
+  if (!alike(rules.good, { files: rules.files, off: [...rules.off] })) rules.compiler.check(files, off).catch(() => {});
   return check({ applies: false });
 }
 
@@ -62,16 +89,128 @@ function showTabs() {
   );
   const tabs = Object.entries(rules.files).map(([name, text]) => {
     const pack = packOf(name);
-    const isRuleset = /^ruleset:/m.test(text);
     const classes = ["pack", name === rules.shown && "shown", bad.has(name) && "bad", rules.off.has(pack) && "off"];
     const attributes = { type: "checkbox", "aria-label": `${pack} takes part`, title: "Takes part" };
     const box = make("input", { ...attributes, onchange: () => toggle(pack) });
     box.checked = !rules.off.has(pack);
-    const button = make("button", { type: "button", onclick: () => show(name) }, isRuleset ? name : pack);
-    return make("span", { class: classes.filter(Boolean).join(" ") }, ...(isRuleset ? [] : [box]), button);
+    const label = isRuleset(text) ? name : pack;
+    const keys = ({ key }) => (key === "F2" ? askName(name) : key === "Delete" && removeFile(name));
+    const pressed = String(name === rules.shown);
+    const button = make("button", { type: "button", "aria-pressed": pressed, onclick: () => show(name), onkeydown: keys }, label);
+    return make("span", { class: classes.filter(Boolean).join(" ") }, ...(isRuleset(text) ? [] : [box]), button);
   });
+  const one = rules.shown;
+  const act = (label, title, onclick) => make("button", { type: "button", class: "small", title, "aria-label": title, onclick }, label);
+  const acts = [
+    act("Rename", `Rename ${one} (F2)`, () => askName(one)),
+    act("Duplicate", `Duplicate ${one}`, () => duplicate(one)),
+    act("Delete", `Delete ${one} (Delete)`, () => removeFile(one)),
+  ];
   const add = make("button", { type: "button", title: "Add a pack of your own", onclick: addPack }, "+ pack");
-  $("packs").replaceChildren(...tabs, add);
+  const focused = [...$("packs").querySelectorAll("button, input")].indexOf(document.activeElement);
+  $("packs").replaceChildren(...tabs, add, make("span", { class: "row" }, ...acts));
+  if (focused >= 0) [...$("packs").querySelectorAll("button, input")].at(focused)?.focus();
+}
+
+/** Puts a field for another name in the place of a tab. */
+function askName(name) {
+  const at = Object.keys(rules.files).indexOf(name);
+  const field = make("input", { "aria-label": `Another name for ${packOf(name)}`, size: 12, maxlength: 60 });
+  field.value = packOf(name);
+  field.onkeydown = (event) => {
+    if (event.key === "Enter") field.blur();
+    if (event.key !== "Escape") return;
+    field.value = packOf(name);
+    field.blur();
+  };
+  field.onblur = () => {
+    const pack = field.value.trim();
+    if (pack !== packOf(name) && name in rules.files) renameFile(name, pack);
+    showTabs();
+    $("packs").children[at]?.querySelector("button")?.focus();
+  };
+  $("packs").children[at].querySelector("button").replaceWith(field);
+  field.select();
+}
+
+/** Renames a file, and the pack or ruleset that it declares. */
+function renameFile(name, pack) {
+  const fresh = `${pack}.yaml`;
+  if (!/^[A-Za-z_]\w{0,59}$/.test(pack)) return say(`“${pack}” is no name: letters, digits and _, no digit first`, true);
+  if (fresh in rules.files) return say(`There is a ${fresh} already.`, true);
+  remember([name, fresh]);
+  const text = rules.files[name];
+  move(name, fresh);
+  setText(fresh, text.replace(/^(pack|ruleset): *\w+/m, `$1: ${pack}`));
+  edited();
+}
+
+/** Gives a file another name; its place and the editor's undo stay. */
+function move(name, fresh) {
+  const renamed = ([one, text]) => [one === name ? fresh : one, text];
+  rules.files = Object.fromEntries(Object.entries(rules.files).map(renamed));
+  rules.packs[fresh] = rules.packs[name];
+  delete rules.packs[name];
+  if (rules.off.delete(packOf(name))) rules.off.add(packOf(fresh));
+  if (rules.shown === name) rules.shown = fresh;
+  editor.rename(name, fresh);
+}
+
+function setText(name, text) {
+  rules.files[name] = text;
+  rules.packs[name] = declared(text);
+  editor.add(name, text);
+  if (rules.shown === name) show(name);
+}
+
+/** A pack that another name is typed for gets a file of that name, if there is none. */
+function followNames() {
+  for (const [name, text] of Object.entries(rules.files)) {
+    const [before, now] = [rules.packs[name], declared(text)];
+    if (!now || now === before) continue;
+    rules.packs[name] = now;
+    if (before === packOf(name) && !(`${now}.yaml` in rules.files)) move(name, `${now}.yaml`);
+  }
+}
+
+/** A name like `pack` that no file has. */
+function freeName(pack) {
+  let number = 1;
+  const named = () => (number > 1 ? `${pack}${number}` : pack);
+  while (`${named()}.yaml` in rules.files) number++;
+  return named();
+}
+
+function duplicate(name) {
+  const pack = freeName(packOf(name).replace(/\d+$/, ""));
+  addFile(`${pack}.yaml`, rules.files[name].replace(/^(pack|ruleset): *\w+/m, `$1: ${pack}`));
+}
+
+const undoButton = () => make("button", { type: "button", class: "small", onclick: () => $("undo").click() }, "Undo");
+
+function removeFile(name) {
+  if (Object.keys(rules.files).length === 1) return say("This is the only file: rules need one.", true);
+  remember([name]);
+  exchange({ [name]: undefined });
+  say(`${name} is deleted. `, false, undoButton());
+}
+
+/** Replaces the texts of some files, or deletes them; `like` has their order, and the packs that are off. */
+function exchange(texts, like = rules.moment()) {
+  const files = {};
+  for (const name of new Set([...Object.keys(like.files), ...Object.keys(rules.files), ...Object.keys(texts)])) {
+    const text = name in texts ? texts[name] : rules.files[name];
+    if (text !== undefined) files[name] = text;
+  }
+  rules.files = files;
+  rules.off = new Set(like.off);
+  for (const [name, text] of Object.entries(texts)) {
+    rules.packs[name] = text && declared(text);
+    if (text === undefined) editor.remove(name);
+    else editor.add(name, text);
+  }
+  show([rules.shown, like.shown].find((name) => name in files) ?? Object.keys(files).at(-1));
+  edited();
 }
 
 function toggle(pack) {
@@ -94,24 +233,34 @@ const FALLING = `    density: 4
     tags: powder
 `;
 
-/** Adds a file, and shows it. */
+/** Adds a file, and shows it; one of that name is replaced. */
 export function addFile(name, text) {
-  rules.files[name] = text;
-  editor.add(name, text);
-  edited();
+  const replaced = name in rules.files;
+  if (rules.files[name] === text) return show(name);
+  remember([name]);
+  exchange({ [name]: text });
   show(name);
+  if (replaced) say(`${name} is replaced. `, false, undoButton());
+}
+
+/** Opens a ruleset with the files that come with it, and those of the present packs that it names. */
+export function addRuleset(files) {
+  const text = Object.values(files).find(isRuleset);
+  const isNamed = (name) => !isRuleset(rules.files[name]) && new RegExp(`\\b${packOf(name)}\\b`).test(text);
+  const gone = Object.keys(rules.files).filter((name) => !isNamed(name));
+  remember([...gone, ...Object.keys(files)]);
+  exchange({ ...Object.fromEntries(gone.map((name) => [name, undefined])), ...files }, { ...rules.moment(), off: [] });
+  show(Object.keys(files).find((name) => isRuleset(files[name])));
 }
 
 function addPack() {
-  const names = new Set(Object.keys(rules.files));
-  const number = [1, 2, 3, 4, 5, 6, 7, 8, 9].find((n) => !names.has(`mine${n > 1 ? n : ""}.yaml`)) ?? 1;
-  const name = `mine${number > 1 ? number : ""}`;
+  const name = freeName("mine");
   addFile(`${name}.yaml`, NEW(name));
 }
 
 let waiting = null;
 function edited() {
-  rules.edited = true;
+  app.unsaved = true;
   [rules.changedAt, rules.checkTook, rules.applyTook] = [performance.now(), null, null];
   clearTimeout(waiting);
   waiting = setTimeout(() => check({ applies: true }), PAUSE);
@@ -151,33 +300,71 @@ async function checkAll() {
 
 async function checkNow(applies) {
   const began = rules.changedAt;
-  const found = await rules.compiler.check(rules.files, [...rules.off]);
+  const { sitting } = app;
+  if (applies) followNames();
+  const [files, off] = [{ ...rules.files }, [...rules.off]];
+  const found = await rules.compiler.check(files, off);
+  if (sitting !== app.sitting) return found; // others were opened meanwhile
+  if (found.ok && alike(rules.good, { files, off })) rules.good = { files, off };
   rules.diagnostics = found.diagnostics;
   rules.checkTook = performance.now() - began;
+  for (const [name, text] of Object.entries(found.texts)) if (!(name in rules.files)) addShipped(name, text);
   if (found.words) editor.know(found.words);
   editor.mark(found.diagnostics);
   showTabs();
+  showMenus();
   showProblems(found.ok);
-  if (again || !found.ok || !applies) return found;
-  await applyRules();
+  while (app.swapping) await app.swapping;
+  if (again || !found.ok || !applies || sitting !== app.sitting) return found;
+  const applied = await applyRules({ files, off });
+  // Another size was chosen meanwhile: the rules have to be compiled for it.
+  if (!applied && sitting === app.sitting) again = true;
   rules.applyTook = performance.now() - began;
   return found;
 }
 
-/** Compiles the checked files for a size, the present one by default, and continues the world under them. */
-export async function applyRules(rows = app.engine.rows, columns = app.engine.columns) {
-  const module = await compiled(rows, columns);
-  const engine = await Engine.start(module);
-  const lost = continueUnder(engine);
-  app.compiled = compiled;
-  for (const one of rules.onApplied) one();
-  const words = lost.length ? `; without ${lost.slice(0, 5).join(", ")}` : "";
-  say(`The new rules run${words}.`);
+/** A pack that ships and that the rules use gets a tab, too. */
+function addShipped(name, text) {
+  rules.files[name] = text;
+  rules.packs[name] = declared(text);
+  editor.add(name, text);
 }
 
-async function compiled(rows, columns) {
-  return WebAssembly.compile(await rules.compiler.call("compile", rows, columns));
+/** Compiles checked files, and continues the world under them. Resolves to whether they run. */
+async function applyRules(good) {
+  const { rows, columns } = app.engine;
+  return swap(async () => {
+    const engine = await Engine.start(await compile(good, rows, columns));
+    return () => {
+      const lost = continueUnder(engine);
+      app.compiled = true;
+      rules.good = good;
+      for (const one of rules.onApplied) one();
+      const words = lost.length ? `; without ${lost.slice(0, 5).join(", ")}` : "";
+      say(`The new rules run${words}.`);
+    };
+  });
 }
+
+/** The bytes of modules that were compiled here. @type {WeakMap<WebAssembly.Module, Uint8Array>} */
+export const bytesOf = new WeakMap();
+
+/** A module of some files; null if they have mistakes. */
+export async function compile({ files, off }, rows, columns) {
+  const { compiler } = rules;
+  // Both requests leave together, so that no other check comes between them.
+  const checking = compiler.holds === files ? { ok: true } : compiler.check(files, off);
+  const compiling = compiler.call("compile", rows, columns);
+  compiling.catch(() => {});
+  if (!(await checking).ok) return null;
+  const bytes = await compiling;
+  const module = await WebAssembly.compile(bytes);
+  bytesOf.set(module, bytes);
+  return module;
+}
+
+/** A module of the rules that run. */
+export const compiled = (rows, columns) => compile(rules.good, rows, columns);
 
 function continueUnder(engine) {
   const before = app.engine.snapshot();
@@ -216,5 +403,5 @@ function showProblems(ok) {
   $("problems").replaceChildren(...shown);
 }
 
-app.onRules.push((sheet) => openFiles(sheet.files, sheet.off));
-if (app.rules) openFiles(app.rules.files, app.rules.off);
+app.onRules.push((sheet, edits) => openFiles(edits ?? sheet));
+if (app.rules) openFiles(app.opened ?? app.rules);

@@ -17,10 +17,11 @@ let dirty = true;
 /** Puts an engine in the place of the present one. Its world is whatever it holds. */
 export function use(engine) {
   const first = app.engine === null;
-  const parameters = app.engine && new Map(app.engine.parameters.map((one, i) => [one.name, app.engine.values[i]]));
+  const before = app.engine;
+  const parameters = new Map(before?.parameters.flatMap((one, i) => (before.values[i] === one.value ? [] : [[one.name, before.values[i]]])));
   app.engine = engine;
   app.checkpoints = [];
-  if (parameters && app.keepParameters) {
+  if (app.keepParameters) {
     engine.parameters.forEach(({ name }, i) => parameters.has(name) && engine.setParameter(i, parameters.get(name)));
   }
   $("canvas").width = engine.columns;

@@ -1,22 +1,18 @@
 // Tools: what they do to the world, their buttons, and what can be undone.
 
 import { $, fill, make, say } from "./dom.js";
+import { ARRAYS } from "./engine.js";
 import { clearChart, leaveCell, showCell } from "./readings.js";
 import { redraw, refresh, setRunning, step } from "./stage.js";
 import { app } from "./state.js";
 import { markStop } from "./tabs.js";
+import { remember } from "./work.js";
 import { Surface, region, stroke } from "./view.js";
 
 export const SPEEDS = [1, 2, 5, 10, 20, 30, 60, 120, 240, 480];
 
 let mask = new Uint8Array(0);
 let erasing = false;
-
-/** Keeps the world as it is, before an edit. */
-export function remember() {
-  app.history.keep(app.engine.snapshot());
-  app.checkpoints = [];
-}
 
 /** Applies the tool from one cell to another. */
 function apply(from, to, erases = false) {
@@ -38,11 +34,19 @@ function apply(from, to, erases = false) {
   redraw();
 }
 
+/** The number nearest to a value that such an array holds: it would wrap. */
+function held(type, value) {
+  if (type === Float32Array) return value;
+  const bits = 8 * type.BYTES_PER_ELEMENT;
+  const low = new type([-1])[0] < 0 ? -(2 ** (bits - 1)) : 0;
+  return Math.min(Math.max(Math.round(value), low), low + 2 ** bits - 1);
+}
+
 function setChosenField() {
   const { engine } = app;
   const number = Number($("field").value);
   const { components } = engine.fields[number];
-  const value = Number($("value").value) || 0;
+  const value = held(ARRAYS[engine.fields[number].type], Number($("value").value) || 0);
   if (components === 1) engine.setField(number, mask, [value]);
   else {
     const view = engine.field(number);
@@ -57,6 +61,7 @@ app.surface = new Surface($("canvas"), {
     if (picks) return choose(app.engine.byId.get(app.engine.ids()[cell[0] * app.engine.columns + cell[1]]));
     if (app.tool === "look") return app.explain ? app.explain(cell) : say("The compiler is still loading.");
     remember();
+    app.painted = true;
     [app.held, erasing] = [cell, erases];
     if (app.tool === "wind") return refresh();
     apply(cell, cell, erases);
@@ -110,18 +115,9 @@ app.onEngine.push((engine) => {
   showFields();
 });
 
-function timeTravel(found) {
-  if (!found) return;
-  app.engine.restore(found);
-  app.checkpoints = [];
-  refresh();
-}
-
-export const undo = () => app.history.past.length && timeTravel(app.history.undo(app.engine.snapshot()));
-export const redo = () => app.history.future.length && timeTravel(app.history.redo(app.engine.snapshot()));
-
 export function reset() {
   remember();
+  app.painted = app.named.world === "";
   app.engine.restore(app.start);
   clearChart();
   refresh();

@@ -3,6 +3,7 @@
 import { ARRAYS } from "./engine.js";
 
 export const MAX_SIDE = 512;
+export const MAX_CLOCK = 2n ** 63n - 1n; // of seeds and steps
 
 export class BadWorld extends Error {}
 
@@ -50,7 +51,7 @@ export function readWorld(data) {
     fields.set(name, { components, values: new ARRAYS[type](raw.buffer) });
   }
   const clock = (data.clock ?? ["0", "0", "0"]).map(String);
-  expect(clock.length === 3 && clock.every((one) => /^\d{1,18}$/.test(one)), "a bad clock");
+  expect(clock.length === 3 && clock.every((one) => /^\d{1,19}$/.test(one) && BigInt(one) <= MAX_CLOCK), "a bad clock");
   return { rows, columns, palette, ids, fields, clock: clock.map(BigInt) };
 }
 
