@@ -43,6 +43,8 @@ class Tested:
     only: tuple[str, ...]
     worlds: int
     """Worlds of each test, or transitions that were recorded."""
+    steps: int
+    """How many steps are predicted."""
     scores: Mapping[str, Mapping[str, Score]]
     missing: Mapping[str, tuple[str, ...]]
     trained: Trained
@@ -62,6 +64,7 @@ class Tested:
             "only": list(self.only),
             "worlds_each": self.worlds,
             "iterations": self.trained.checkpoint.step,
+            "steps": self.steps,
             "mean": {name: {**total[name].plain(), "loss": self.mean(name)} for name in names},
             "tests": {
                 test: {name: scores[name].plain() for name in names} for test, scores in self.scores.items()
@@ -72,8 +75,19 @@ class Tested:
         }
 
 
+def ahead(predict: Network, times: int) -> Network:
+    """A network as one for `times` as many steps: applied to what it predicts, again and again."""
+
+    def predicted(ids: torch.Tensor) -> torch.Tensor:
+        for _ in range(times - 1):
+            ids = predict(ids).argmax(1).to(torch.uint8)
+        return predict(ids)
+
+    return predicted
+
+
 def evaluate(
-    trained: Trained, *, worlds: int | None = None, machine: Machine = HERE, **tested_on: Any
+    trained: Trained, *, worlds: int | None = None, times: int = 1, machine: Machine = HERE, **tested_on: Any
 ) -> Tested:
     """Test a network and both baselines on worlds that training never uses.
 
@@ -81,6 +95,7 @@ def evaluate(
 
     Args:
         worlds: worlds of a split, or random futures of each of its stands; by default 32 and 4.
+        times: how often the network is applied to what it predicts. The baselines learn as many steps at once.
         tested_on: see `unseen_worlds`.
 
     Raises:
@@ -88,14 +103,16 @@ def evaluate(
     """
     unseen = unseen_worlds(trained, machine=machine, **tested_on)
     data, names, slots = trained.config.data, unseen.names, len(trained.palette)
+    steps = data.steps * times
     seeds = torch.arange(min(FIT_WORLDS, data.states), device=machine.device)
     trained_on = TaskWorlds(data, **machine.simulation, palette=trained.palette)
-    fit = pairs_of(trained_on, seeds, data.steps, data.pairs)
-    predictors: dict[str, Network] = {MODEL: trained.network, **_baselines(fit, unseen.rules, slots)}
+    fit = pairs_of(trained_on, seeds, steps, data.pairs)
+    model = ahead(trained.network, times)
+    predictors: dict[str, Network] = {MODEL: model, **_baselines(fit, unseen.rules, slots)}
     count = worlds or (4 if len(names) > 1 else 32)
     scores = {}
     for name, seeds in zip(names, unseen_seeds(count, len(names)).view(len(names), count), strict=True):
-        pairs = list(pairs_of(unseen, seeds.to(machine.device), data.steps, data.pairs))
+        pairs = list(pairs_of(unseen, seeds.to(machine.device), steps, data.pairs))
         scores[name] = {who: score(predict, pairs, slots) for who, predict in predictors.items()}
     return Tested(
         rules=unseen.rules.name,
@@ -103,6 +120,7 @@ def evaluate(
         split=unseen.config.split,
         only=unseen.config.only,
         worlds=count,
+        steps=steps,
         scores=scores,
         missing={variant.name: variant.elements for variant in unseen.missing},
         trained=trained,
@@ -139,6 +157,7 @@ def evaluate_recording(trained: Trained, recording: Recording, *, machine: Machi
         split=recording.dataset.recipe.split,
         only=(),
         worlds=sum(len(ends) for _, ends in pairs),
+        steps=known.steps,
         scores={
             "transitions": {name: score(predictor, pairs, slots) for name, predictor in predictors.items()}
         },
@@ -225,9 +244,7 @@ def strips(predict: Network, worlds: TaskWorlds, *, step: int, times: int = 1, a
     """
     seeds = unseen_seeds(1, len(worlds.names)).to(worlds.device)
     world = worlds.later(worlds.start(seeds), after)
-    predicted = world.ids
-    for _ in range(times):
-        predicted = predict(predicted).argmax(1).to(torch.uint8)
+    predicted = ahead(predict, times)(world.ids).argmax(1).to(torch.uint8)
     truth = worlds.later(world, step * times).ids
     three = [ids.cpu().numpy() for ids in (world.ids, truth, predicted)]
     return [Strip(name, *(ids[n] for ids in three)) for n, name in enumerate(worlds.names)]

@@ -9,7 +9,7 @@ import torch
 
 import powderdsl
 from powderdsl.worldmodel import DataConfig, Machine, TaskWorlds, TrainConfig, evaluate, load_trained, train
-from powderdsl.worldmodel.evaluation import unseen_worlds
+from powderdsl.worldmodel.evaluation import ahead, unseen_worlds
 
 LAWS = """
 task: drawn
@@ -63,4 +63,16 @@ def test_models_are_tested_under_rulesets_that_training_did_not_show(drawn: str,
     assert trained.config.data == data
     assert unseen_worlds(trained, split="train", machine=MACHINE).config.rulesets == 1
     assert unseen_worlds(trained, split="test", machine=MACHINE).config.rulesets == 0
-    assert evaluate(trained, split="test", worlds=4, machine=MACHINE).mean("model") > 0
+    near, far = (evaluate(trained, split="test", worlds=4, times=times, machine=MACHINE) for times in (1, 3))
+    assert (near.steps, far.steps) == (2, 6)
+    assert near.mean("model") != far.mean("model") > 0
+
+
+def test_a_network_predicts_several_times_its_steps() -> None:
+    def rise(ids: torch.Tensor) -> torch.Tensor:
+        """Every cell becomes the next of five elements."""
+        return torch.nn.functional.one_hot((ids.long() + 1) % 5, 5).permute(0, 3, 1, 2)
+
+    ids = torch.tensor([[[0, 3], [4, 1]]], dtype=torch.uint8)
+    assert ahead(rise, 1)(ids).argmax(1).tolist() == [[[1, 4], [0, 2]]]
+    assert ahead(rise, 3)(ids).argmax(1).tolist() == [[[3, 1], [2, 4]]]

@@ -171,6 +171,7 @@ def finetune_command(run: str, packs: tuple[str, ...], folder: Path | None, **va
 @opt.option(
     "--worlds", (1, 1 << 20), "Worlds of the split, or futures of each designed world.  [default: 32, 4]"
 )
+@opt.option("--steps", (1, 4096), "Steps to predict.  [default: as trained]")
 @opt.option("--json", bool, "One JSON object instead of a table.", to="as_json")
 def eval_command(run: str, as_json: bool, **values: Any) -> None:
     """Test a network beside two baselines.
@@ -184,16 +185,29 @@ def eval_command(run: str, as_json: bool, **values: Any) -> None:
     from powderdsl.worldmodel.evaluation import evaluate, evaluate_recording
 
     trained, recording, machine = _load_network(run, values)
+    times = _times(trained, values["steps"])
+    if recording is not None and times > 1:
+        raise BadInput(f"--steps {values['steps']}: recorded transitions have {trained.config.data.steps}")
     if recording is not None:
         tested = evaluate_recording(trained, recording, machine=machine)
     else:
-        tested = evaluate(trained, worlds=values["worlds"], machine=machine, **tested_on(values))
+        how = {"worlds": values["worlds"], "times": times, "machine": machine}
+        tested = evaluate(trained, **how, **tested_on(values))
     plain = tested.plain()
     write_json(trained.run.path / "evaluation.json", plain)
     if as_json:
         print_json(plain)
     else:
         click.echo("\n".join(_result_tables(tested, plain)))
+
+
+def _times(trained: Trained, steps: int | None) -> int:
+    """How often a network is applied to predict some steps."""
+    times, rest = divmod(steps or trained.config.data.steps, trained.config.data.steps)
+    if rest:
+        step = trained.config.data.steps
+        raise BadInput(f"--steps {steps}: this network predicts {step} steps, or several times as many")
+    return times
 
 
 @command.command("show", cls=opt.Command)
@@ -213,12 +227,9 @@ def show_command(run: str, out: Path, scale: int, **values: Any) -> None:
     if recording is not None:
         _show(recorded_strips(trained.network, recording), recording.rules, out, scale)
         return
-    step = trained.config.data.steps
-    steps = values["steps"] or step
-    if steps % step:
-        raise BadInput(f"--steps {steps}: this network predicts {step} steps, or several times as many")
+    step, times = trained.config.data.steps, _times(trained, values["steps"])
     worlds = unseen_worlds(trained, machine=machine, **tested_on(values))
-    tests = strips(trained.network, worlds, step=step, times=steps // step, after=values["after"] or 0)
+    tests = strips(trained.network, worlds, step=step, times=times, after=values["after"] or 0)
     _show(tests, worlds.rules, out, scale)
     for variant in worlds.missing:
         click.echo(f"left out: {variant.name}, which needs {', '.join(variant.elements)}", err=True)
