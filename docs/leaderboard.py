@@ -103,7 +103,9 @@ def replay(paths: Sequence[Path], sample: int, seed: int, tolerance: float) -> b
     for entry, point in random.Random(seed).sample(choices, min(sample, len(choices))):
         changes = differences(entry, point)
         largest = max(map(abs, changes.values()))
-        print(shlex.join(command_of(entry, point)), f"largest difference {largest:.6g}", sep="\n  ", flush=True)
+        print(
+            shlex.join(command_of(entry, point)), f"largest difference {largest:.6g}", sep="\n  ", flush=True
+        )
         same &= largest <= tolerance
     return same
 

@@ -82,12 +82,15 @@ def main(arguments: list[str] | None = None) -> dict[str, float]:
     torch.set_num_threads(1)
     runs = json.loads(args.out.read_text()) if args.out.exists() else {}
     names = [
-        f"task={args.task},rulesets={args.rulesets},steps={args.steps},seed={seed}" for seed in range(args.seeds)
+        f"task={args.task},rulesets={args.rulesets},steps={args.steps},seed={seed}"
+        for seed in range(args.seeds)
     ]
     for seed, name in enumerate(names):
         if name not in runs:
             model = train(args, seed)
-            runs[name] = {split: play(model, make_env(args, args.worlds, split)) for split in ("train", "test")}
+            runs[name] = {
+                split: play(model, make_env(args, args.worlds, split)) for split in ("train", "test")
+            }
             args.out.write_text(json.dumps(runs, indent=1))
         print(name, *(f"{split} {mean:.3f}" for split, mean in runs[name].items()), flush=True)
     return {split: float(np.mean([runs[name][split] for name in names])) for split in ("train", "test")}

@@ -110,7 +110,16 @@ def test_iql_plays_better_than_its_data(torch: Any, task: Path, tmp_path: Path) 
 
 def test_an_agent_with_a_memory_learns_and_continues(torch: Any, task: Path, tmp_path: Path) -> None:
     pytest.importorskip("sb3_contrib", reason="needs sb3-contrib")
-    options = ["--task", str(task), "--backend", "wasm", "--worlds", "32", "--out", str(tmp_path / "runs.json")]
+    options = [
+        "--task",
+        str(task),
+        "--backend",
+        "wasm",
+        "--worlds",
+        "32",
+        "--out",
+        str(tmp_path / "runs.json"),
+    ]
     returns = script("recurrent_ppo")([*options, "--steps", "4096"])
     assert returns["test"] > 0
     (name,) = json.loads((tmp_path / "runs.json").read_text())
