@@ -32,3 +32,47 @@ export async function openPage(browser, address, { before, ...options } = {}) {
   await page.waitForFunction(() => globalThis.powderdsl?.firstWorld);
   return { page, problems };
 }
+
+/** What tests do with a page again and again. */
+export function tools(page) {
+  const text = (id) => page.locator(`#${id}`).textContent();
+  const until = (test, argument) => page.waitForFunction(test, argument, { timeout: 60000 });
+  const said = (id, pattern) =>
+    until(([name, source]) => new RegExp(source).test(document.getElementById(name).textContent), [id, pattern.source]);
+  const settled = () => until(() => !powderdsl.swapping);
+  const state = () =>
+    page.evaluate(() => {
+      const { engine, rules, named } = powderdsl;
+      const menus = ["rules", "world", "size", "seed"].map((id) => document.getElementById(id).value);
+      const { ids, clock } = engine.snapshot();
+      const hash = ids.reduce((found, one) => Math.imul(found ^ one, 0x01000193) >>> 0, 0x811c9dc5);
+      const pack = engine.elements.at(-1).qualified.split(".")[0];
+      return { menus, key: rules.key, named, size: `${engine.rows}x${engine.columns}`, pack, hash, clock: clock.map(String) };
+    });
+  const count = (name) =>
+    page.evaluate((one) => {
+      const { engine } = powderdsl;
+      return engine.counts()[engine.elements.find((each) => each.name === one)?.id] ?? 0;
+    }, name);
+  const choose = async (id, value) => {
+    await page.locator(`#${id}`).selectOption(value);
+    await settled();
+  };
+  const edit = (from, to) =>
+    page.evaluate(
+      ([old, fresh]) => {
+        const { view } = powderdsl.edits.editor;
+        const at = view.state.doc.toString().indexOf(old);
+        if (at < 0) throw new Error(`${old} is not in the file`);
+        view.dispatch({ changes: { from: at, to: at + old.length, insert: fresh } });
+      },
+      [from, to],
+    );
+  const applied = () => until(() => powderdsl.edits.applyTook !== null);
+  const files = () => page.evaluate(() => Object.keys(powderdsl.edits.files));
+  async function paint(x, y) {
+    const box = await page.locator("#canvas").boundingBox();
+    await page.mouse.click(box.x + box.width * x, box.y + box.height * y);
+  }
+  return { text, until, said, settled, state, count, choose, edit, applied, files, paint };
+}

@@ -13,7 +13,7 @@ import pytest
 
 from powderdsl.web.site import Site, SiteServer
 from tests.web.test_page import HERE, needed
-from tests.wheels import once, succeed
+from tests.wheels import succeed
 
 
 @pytest.fixture(scope="module")
@@ -27,17 +27,17 @@ def address() -> Iterator[str]:
     server.server_close()
 
 
+def script(name: str, address: str, folder: Path, *words: str) -> dict[str, Any]:
+    """What a script saw."""
+    text = succeed(str(shutil.which("node")), HERE / name, address, *words, cwd=folder)
+    found: dict[str, Any] = json.loads(text)
+    assert [one for one in found["problems"] if "status of 500" not in one] == []
+    return found
+
+
 @pytest.fixture(scope="module")
 def seen(address: str, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
-    """What work.mjs saw."""
-
-    def use(folder: Path) -> None:
-        text = succeed(str(shutil.which("node")), HERE / "work.mjs", address, folder, cwd=folder)
-        (folder / "seen.json").write_text(text, encoding="utf-8")
-
-    folder = once(tmp_path_factory, "work", use)
-    found: dict[str, Any] = json.loads((folder / "seen.json").read_text(encoding="utf-8"))
-    return found
+    return script("undo.mjs", address, tmp_path_factory.mktemp("undo"))
 
 
 def test_sizes_seeds_worlds_and_rules_can_be_undone(seen: dict[str, Any]) -> None:
@@ -76,4 +76,14 @@ def test_values_of_fields_are_cut(seen: dict[str, Any]) -> None:
 
 def test_keys(seen: dict[str, Any]) -> None:
     assert (seen["spaceRuns"], seen["spacePauses"]) == (True, True)
-    assert [one for one in seen["problems"] if "status of 500" not in one] == []
+
+
+def test_work_is_kept(address: str, tmp_path: Path) -> None:
+    found = script("work.mjs", address, tmp_path, str(tmp_path))
+    assert (found["module"], found["reloaded"]) == (True, True)
+    assert "is back" in found["back"]
+    assert found["link"][1] == "life"
+    assert "Your earlier work is under Recent." in found["link"][0]
+    assert (found["wentBack"], found["fromList"], found["undoneLink"]) == (True, True, "life")
+    assert "powderworld, sand.yaml" in found["recent"]
+    assert "is back" in found["newTab"]

@@ -1,146 +1,89 @@
-// Work is kept and can be undone, and swaps of the engine do not race: node work.mjs ADDRESS FOLDER
+// Work is kept: through reloads, links over it, in other tabs: node work.mjs ADDRESS FOLDER
 import { join } from "node:path";
-import { launch, openPage } from "./browser.mjs";
+import { launch, openPage, tools } from "./browser.mjs";
 
 const [address, folder] = process.argv.slice(2);
 const browser = await launch();
-const { page, problems } = await openPage(browser, address);
+const context = await browser.newContext({ viewport: { width: 1440, height: 900 } });
+const { page, problems } = await openPage(context, address);
+const { text, until, said, settled, state, edit, applied, paint } = tools(page);
 const seen = {};
 
-const text = (id) => page.locator(`#${id}`).textContent();
-const until = (test, argument) => page.waitForFunction(test, argument, { timeout: 60000 });
-const said = (id, pattern) =>
-  until(([name, source]) => new RegExp(source).test(document.getElementById(name).textContent), [id, pattern.source]);
-const settled = () => until(() => !powderdsl.swapping);
-const state = () =>
+// A reload loses nothing: neither the world, nor a text with a mistake, nor settings.
+const whole = () =>
   page.evaluate(() => {
-    const { engine, rules, named } = powderdsl;
-    const menus = ["rules", "world", "size", "seed"].map((id) => document.getElementById(id).value);
-    const { ids, clock } = engine.snapshot();
-    const hash = ids.reduce((found, one) => Math.imul(found ^ one, 0x01000193) >>> 0, 0x811c9dc5);
-    const pack = engine.elements.at(-1).qualified.split(".")[0];
-    return { menus, key: rules.key, named, size: `${engine.rows}x${engine.columns}`, pack, hash, clock: clock.map(String) };
+    const { edits, element, engine, named, start } = powderdsl;
+    const { files, off, shown } = edits.moment();
+    const { ids, fields, clock } = engine.snapshot();
+    const values = [...fields.values()].map((one) => one.values.join());
+    const speed = document.getElementById("speed").value;
+    return JSON.stringify([files, off, shown, ids.join(), values, clock.map(String), engine.values, named, start.ids.join(), element, speed]);
   });
-const count = (name) =>
-  page.evaluate((one) => {
-    const { engine } = powderdsl;
-    return engine.counts()[engine.elements.find((each) => each.name === one)?.id] ?? 0;
-  }, name);
-const choose = async (id, value) => {
-  await page.locator(`#${id}`).selectOption(value);
-  await settled();
-};
-const edit = (from, to) =>
-  page.evaluate(
-    ([old, fresh]) => {
-      const { view } = powderdsl.edits.editor;
-      const at = view.state.doc.toString().indexOf(old);
-      if (at < 0) throw new Error(`${old} is not in the file`);
-      view.dispatch({ changes: { from: at, to: at + old.length, insert: fresh } });
-    },
-    [from, to],
-  );
-const applied = () => until(() => powderdsl.edits.applyTook !== null);
-const files = () => page.evaluate(() => Object.keys(powderdsl.edits.files));
-async function paint(x, y) {
-  const box = await page.locator("#canvas").boundingBox();
-  await page.mouse.click(box.x + box.width * x, box.y + box.height * y);
-}
-
-// While the compiler loads: sizes, seeds and worlds can be undone, and a painted world keeps its cells.
+const ready = () => until(() => powderdsl.compilerReady && powderdsl.linkOpened && powderdsl.edits);
 await page.locator("#run").click();
-await choose("world", "empty");
-await page.locator("#elements button", { hasText: "sand" }).click();
-await page.keyboard.press(" ");
-seen.spaceRuns = await page.evaluate(() => powderdsl.running);
-await page.keyboard.press(" ");
-seen.spacePauses = !(await page.evaluate(() => powderdsl.running));
-await paint(0.5, 0.5);
-const painted = await state();
-seen.sand = [await count("sand")];
-for (const size of ["128x128", "64x64"]) {
-  await choose("size", size);
-  seen.sand.push(await count("sand"));
-}
-seen.framed = await page.evaluate(() => {
-  const { engine, rules } = powderdsl;
-  return [engine.ids()[0], engine.ids().at(-1), engine.counts()[rules.frame]].join() === [rules.frame, rules.frame, 252].join();
-});
-await choose("size", "128x128");
-await choose("world", "random");
-await page.locator("#seed").fill("7");
-await page.locator("#seed").press("Enter");
-const random = await state();
-await choose("rules", "life");
-await page.locator("#run").click();
-await page.locator("#reset").click();
-const life = await state();
-const journey = [];
-for (let i = 0; i < 7; i++) {
-  await page.locator("#undo").click();
-  await settled();
-  journey.push(await state());
-}
-seen.undone = [journey[1].hash === random.hash && journey[1].key === "powderworld", journey.at(-1).hash === painted.hash];
-seen.undoneMenus = journey.map((one) => one.menus.join(" "));
-for (let i = 0; i < 7; i++) {
-  await page.locator("#redo").click();
-  await settled();
-}
-const redone = await state();
-seen.redone = redone.key === "life" && redone.hash === life.hash;
-
-// Seeds as on the command line, shown as they are used.
-seen.seeds = [];
-for (const seed of ["-1", "99999999999", "9223372036854775807", "9223372036854775808", "1.5", "1e3"]) {
-  await page.locator("#seed").fill(seed);
-  await page.locator("#seed").press("Enter");
-  const { menus, clock } = await state();
-  seen.seeds.push(`${menus[3]} ${clock[0]}`);
-}
-
-// A value that a field's numbers cannot hold is cut, not wrapped.
-await choose("rules", "powderworld");
-await page.locator("[data-tool=field]").click();
-const fields = await page.evaluate(() => powderdsl.engine.fields.map((one) => `${one.name} ${one.type}`));
-await page.locator("#field").selectOption(String(fields.findIndex((one) => / int8/.test(one))));
-await page.locator("#value").fill("200");
-await paint(0.5, 0.5);
-const middle = () => page.evaluate(() => {
-  const { engine } = powderdsl;
-  return Math.max(...engine.field(Number(document.getElementById("field").value)));
-});
-seen.field = await middle();
-await page.locator("[data-tool=brush]").click();
-
-// What fails to load leaves the menus as they were.
-await page.route("**/rules/wireworld*", (route) => route.fulfill({ status: 500, body: "no" }));
-await choose("rules", "wireworld");
-seen.failed = (await state()).menus[0];
-await page.unroute("**/rules/wireworld*");
-
-// Rules that are chosen while edited ones are compiled: those that were chosen run.
-await until(() => powderdsl.compilerReady && powderdsl.linkOpened);
+await ready();
 await said("problems", /No mistakes/);
-await page.evaluate(() => {
-  const { compiler } = powderdsl.edits;
-  const { call } = compiler;
-  compiler.call = async (...words) => {
-    const found = await call.apply(compiler, words);
-    if (words[0] === "compile") powderdsl.compiles = (powderdsl.compiles ?? 0) + 1;
-    if (words[0] === "compile") await new Promise((resolve) => setTimeout(resolve, 400));
-    return found;
-  };
-});
-await edit("density: 4", "density: 3");
-await until(() => powderdsl.compiles);
-await choose("rules", "life");
-await page.waitForTimeout(600);
-const raced = await state();
-seen.raced = [raced.menus[0], raced.key, raced.pack, Object.keys(await page.evaluate(() => powderdsl.edits.files))[0] && (await files())[0]];
+await page.locator("#packs button", { hasText: "sand" }).click();
+await edit("density: 4", "density: 5");
+await applied();
+await edit("density: 5", "densit: 5");
+await until(() => powderdsl.edits.checkTook !== null);
+await page.locator("[data-panel=parameters]").click();
+await page.locator("#parameters input").first().fill("0.25");
+await page.locator("[data-panel=rules-panel]").click();
+await page.locator("#speed").fill("3");
+await paint(0.3, 0.3);
+const kept = await whole();
+await page.reload();
+await until(() => globalThis.powderdsl?.firstWorld);
+seen.module = await page.evaluate(() => powderdsl.compiled);
+await ready();
+await until(() => powderdsl.edits.diagnostics.length);
+seen.reloaded = (await whole()) === kept;
+seen.back = await text("status");
+await edit("densit: 5", "density: 5");
+await applied();
+
+// A link over it: the work is in the list, and Back returns to it.
+await page.locator("#step").click();
+const before = await whole();
+const same = async () => (await whole()) === before;
+const other = await openPage(browser, address);
+await other.page.locator("#run").click();
+await other.page.waitForFunction(() => powderdsl.linkOpened, null, { timeout: 60000 });
+await other.page.locator("#rules").selectOption("life");
+await other.page.waitForFunction(() => powderdsl.rules.key === "life");
+await other.page.locator("#share").click();
+await other.page.waitForFunction(() => location.hash.length > 10);
+const link = await other.page.evaluate(() => location.hash);
+await other.page.close();
+await page.evaluate((hash) => (location.hash = hash), link);
+await said("status", /world of the link/);
+seen.link = [await text("status"), (await state()).key];
+await page.screenshot({ path: join(folder, "link.png") });
+await page.goBack();
+await said("status", /earlier work/);
+seen.wentBack = await same();
+await page.goForward();
+await until(() => powderdsl.rules.key === "life");
+await page.locator("#recent summary").click();
+await page.locator("#recent div button").first().waitFor();
+await page.screenshot({ path: join(folder, "recent.png") });
+seen.recent = await page.locator("#recent span").first().innerText();
+await page.locator("#recent div button").first().click();
+await said("status", /your work of/);
+seen.fromList = await same();
 await page.locator("#undo").click();
 await settled();
-seen.edited = [await text("rules"), await page.evaluate(() => powderdsl.edits.files["sand.yaml"].includes("density: 3"))];
+seen.undoneLink = (await state()).key;
+await page.locator("#redo").click();
+await settled();
+const again = await page.context().newPage();
+await page.close({ runBeforeUnload: true });
+await again.waitForTimeout(300);
+await again.goto(address);
+await again.waitForFunction(() => globalThis.powderdsl?.firstWorld);
+seen.newTab = await again.locator("#status").textContent();
 seen.problems = problems;
 console.log(JSON.stringify(seen, null, 1));
 await browser.close();

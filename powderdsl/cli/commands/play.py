@@ -18,14 +18,14 @@ if TYPE_CHECKING:
 @click.command("play")
 @click.argument("rules", metavar="[RULES]", required=False)
 @opt.world
-@opt.option("--port", (0, 65535), "Port of the server; 0 for any.", 0)
+@opt.option("--port", (0, 65535), "Port of the server; 0 for any.  [default: 8372 if it is free]")
 @opt.option("--no-open", bool, "Do not open a browser.")
 @opt.path("--export", "DIR", "Write the page as a folder for any web server, and exit.")
 @opt.parameters
 def command(
     rules: str | None,
     world: str | None,
-    port: int,
+    port: int | None,
     no_open: bool,
     export: Path | None,
     settings: dict[str, str],
@@ -62,15 +62,21 @@ def command(
         _serve(site, port, not no_open)
 
 
-def _serve(site: Site, port: int, opens: bool) -> None:
+PORT = 8372
+"""Always the same, where it is free: browsers keep work for an address."""
+
+
+def _serve(site: Site, port: int | None, opens: bool) -> None:
     import webbrowser
 
     from powderdsl.web.site import SiteServer
 
     try:
-        server = SiteServer(site, port)
+        server = SiteServer(site, PORT if port is None else port)
     except OSError as error:
-        raise BadInput(f"port {port} cannot be used: {error.strerror}; choose another --port") from None
+        if port is not None:
+            raise BadInput(f"port {port} cannot be used: {error.strerror}; choose another --port") from None
+        server = SiteServer(site)
     click.echo("compiling the first world", err=True)
     for path in ("catalog.json", site.start):
         site.read(path)

@@ -4,6 +4,7 @@ import { $, failed, get } from "./dom.js";
 import { addWorlds, chooseRules, openRules, resize, startWorld } from "./opening.js";
 import { layout, newPainter, refresh, setRunning } from "./stage.js";
 import { app } from "./state.js";
+import { restore } from "./store.js";
 import { arrows, showPanel } from "./tabs.js";
 import { SPEEDS, choose, reset, setBrush, setSpeed, setTool, showComponents, showElements, stepOnce } from "./tools.js";
 import { redo, undo } from "./work.js";
@@ -75,7 +76,8 @@ async function begin() {
   showPanel("rules-panel");
   app.catalog = await (await get("catalog.json")).json();
   const [first] = app.catalog.rules;
-  await openRules(first.key, { size: first.sizes[0].join("x") });
+  app.isBack = await restore().catch((error) => console.info(`powderdsl: ${error}`));
+  if (!app.isBack) await openRules(first.key, { size: first.sizes[0].join("x") });
   app.firstWorld = performance.now();
   // The rest comes after the first picture: the editor, and Python in a worker.
   await import("./panels.js");

@@ -39,7 +39,8 @@ export async function link() {
 
 async function share() {
   const address = await link();
-  history.replaceState(null, "", new URL(address).hash);
+  history.replaceState(history.state, "", new URL(address).hash);
+  app.unsaved = true;
   try {
     await navigator.clipboard.writeText(address);
     say(`The link is copied: ${address.length.toLocaleString("en")} characters hold the rules and the world.`);
@@ -138,14 +139,14 @@ on("save-png", async () => download(await png($("canvas")), "world.png"));
 on("save-gif", () => saveFilm(gif, "world.gif"));
 on("save-webm", () => saveFilm(webm, "world.webm"));
 $("save").addEventListener("toggle", () => $("save").open && showEntries().catch(failed));
-addEventListener("pointerdown", ({ target }) => {
-  if (!$("save").contains(target)) $("save").open = false;
-});
-addEventListener("keydown", ({ key }) => {
-  if (key !== "Escape" || !$("save").open) return;
-  $("save").open = false;
-  $("save").querySelector("summary").focus();
-});
+for (const menu of document.querySelectorAll(".menu")) {
+  addEventListener("pointerdown", ({ target }) => menu.contains(target) || (menu.open = false));
+  addEventListener("keydown", ({ key }) => {
+    if (key !== "Escape" || !menu.open) return;
+    menu.open = false;
+    menu.querySelector("summary").focus();
+  });
+}
 missing().then((reason) => {
   $("save-webm").disabled = $("no-video").textContent = reason;
   $("no-video").hidden = !reason;
@@ -160,7 +161,7 @@ addEventListener("drop", (event) => {
   event.preventDefault();
   openAll([...(event.dataTransfer?.files ?? [])]).catch(failed);
 });
-addEventListener("hashchange", () => openLink(location.hash).catch(failed));
-openLink(location.hash)
+addEventListener("hashchange", () => history.state?.work || openLink(location.hash).catch(failed));
+(app.isBack ? Promise.resolve() : openLink(location.hash))
   .catch(failed)
   .finally(() => (app.linkOpened = true));

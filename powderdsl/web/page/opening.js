@@ -6,7 +6,7 @@ import { clearChart } from "./readings.js";
 import { hasModule, listedRules, moduleOf, sheetOf, shippedModule } from "./shipped.js";
 import { refresh, setRunning, use } from "./stage.js";
 import { app } from "./state.js";
-import { isWork, newSitting, open, remember, showMenus, swap } from "./work.js";
+import { isWork, newSitting, newWork, open, remember, showMenus, swap } from "./work.js";
 import { MAX_CLOCK, readWorld } from "./worlds.js";
 
 /** Opens rules of the site. Resolves to whether they are open. */
@@ -34,15 +34,13 @@ export function openRules(key, { size: wanted = "64x64", run = true } = {}) {
 
 /** Opens a moment as another piece of work. Returns what became of the present one, in words. */
 function land(found, engine) {
-  const kept = app.engine !== null && isWork();
-  if (app.engine) remember();
-  if (kept) app.save?.();
-  const work = kept || !app.work ? newWork() : app.work;
-  open({ ...found, sitting: newSitting(), work }, engine);
+  const first = app.engine === null;
+  const kept = !first && isWork();
+  if (!first) [remember(), app.save?.()];
+  open({ work: newWork(), ...found, sitting: newSitting() }, engine);
+  if (!first) app.save?.();
   return kept ? (app.save ? "Your earlier work is under Recent." : "Undo brings your earlier work back.") : "";
 }
-
-const newWork = () => `${Date.now().toString(36)}-${Math.random().toString(36).slice(2, 10)}`;
 
 export const chooseRules = (key) => openRules(key, { size: $("size").value }).catch(failed);
 
@@ -168,10 +166,10 @@ export function openWork(found, { words, run = false, work } = {}) {
       const named = found.named ?? { world: "", seed: String(world.clock[0]) };
       const compiled = edited && module !== null;
       const start = found.start ?? world;
-      const kept = land({ sheet, module: runs, compiled, edits, parameters, world, start, named, painted: found.painted ?? true }, engine);
-      if (work) app.work = work;
+      const painted = found.painted ?? true;
+      const kept = land({ sheet, module: runs, compiled, edits, parameters, world, start, named, painted, work: work ?? newWork() }, engine);
       setRunning(run);
-      if (module) say([words, kept].filter(Boolean).join(" "));
+      if (module) say([words || sheet.about, kept].filter(Boolean).join(" "));
       else say("The rules have mistakes: see the list below the editor.", true);
     };
   });

@@ -7,7 +7,7 @@ import { Engine } from "./engine.js";
 import { refresh, use } from "./stage.js";
 import { app } from "./state.js";
 import { choose } from "./tools.js";
-import { remember, showMenus, swap } from "./work.js";
+import { bytesOf, remember, showMenus, swap } from "./work.js";
 
 const PAUSE = 120; // ms without a key before a check
 export const packOf = (file) => file.replace(/\.ya?ml$/, "");
@@ -345,9 +345,6 @@ async function applyRules(good) {
     };
   });
 }
-
-/** The bytes of modules that were compiled here. @type {WeakMap<WebAssembly.Module, Uint8Array>} */
-export const bytesOf = new WeakMap();
 
 /** A module of some files; null if they have mistakes. */
 export async function compile({ files, off }, rows, columns) {

@@ -96,8 +96,12 @@ export function remember(names) {
 
 const textsOf = (names, { files }) => Object.fromEntries(names.map((name) => [name, files[name]]));
 
+/** The bytes of modules that were compiled here. @type {WeakMap<WebAssembly.Module, Uint8Array>} */
+export const bytesOf = new WeakMap();
+
 let sittings = 0;
 export const newSitting = () => ++sittings;
+export const newWork = () => `${Date.now().toString(36)}-${Math.random().toString(36).slice(2, 10)}`;
 
 /** Opens a moment, with an engine of its rules and size. Resolves to the names that its rules lack. @param {Moment} found */
 export function open(found, engine) {
