@@ -20,6 +20,7 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # runs from a checkout that is not installed
 
+from powderdsl.cli.commands.schema import schema
 from powderdsl.cli.dispatch import GROUPS
 from powderdsl.compiler import MAX_BASES, shipped_rules
 from powderdsl.experiments.studies import study as _study_file  # noqa: F401  # declares the records of studies
@@ -48,6 +49,7 @@ from powderdsl.tasks import file as _task_file  # noqa: F401  # declares the rec
 from powderdsl.worlds.scene.statements import SETTING, STATEMENTS
 
 DOCS = Path(__file__).resolve().parent
+SCHEMA = DOCS / "powderdsl.schema.json"
 PAGES = (DOCS.parent / "README.md", *sorted(DOCS.rglob("*.md")))
 DRAWN = re.compile(r"^<!-- powderdsl (.*) --out (docs/images/\S+) -->$", re.MULTILINE)
 MARKED = re.compile(r"(<!-- generated: ([\w ]+) -->\n).*?(<!-- end -->)", re.DOTALL)
@@ -335,9 +337,14 @@ def generated(markdown: str) -> str:
     return MARKED.sub(lambda found: found[1] + TABLES[found[2]]() + found[3], markdown)
 
 
+def fresh_text(path: Path) -> str:
+    """A page with all its tables rewritten, or the JSON Schema."""
+    return json.dumps(schema(), indent=1) + "\n" if path == SCHEMA else generated(path.read_text("utf-8"))
+
+
 def stale_pages() -> list[Path]:
-    """Pages whose tables are not what the package says."""
-    return [page for page in PAGES if generated(text := page.read_text("utf-8")) != text]
+    """Files that are not what the package says."""
+    return [path for path in (*PAGES, SCHEMA) if fresh_text(path) != path.read_text("utf-8")]
 
 
 def pictures() -> dict[str, list[str]]:
@@ -362,7 +369,7 @@ def main(arguments: list[str]) -> int:
     for page in stale:
         print(f"{'stale' if '--check' in arguments else 'written'}: {page.relative_to(DOCS.parent)}")
         if "--check" not in arguments:
-            page.write_text(generated(page.read_text("utf-8")), "utf-8")
+            page.write_text(fresh_text(page), "utf-8")
     return 1 if stale and "--check" in arguments else 0
 
 

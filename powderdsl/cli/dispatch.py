@@ -32,6 +32,7 @@ GROUPS = {
         "trace": "Explain a cell: which rule wrote it, and what the rule read.",
         "show": "List elements, reactions, passes and parameters, or describe a task.",
         "universe": "Print the rule pack of a seed: invented elements and laws.",
+        "schema": "Print the JSON Schema of all files, for editors.",
         "explain": "Explain a diagnostic code and how to fix it.",
         "compile": "Print the output of a compiler stage.",
         "bench": "Measure how fast rules run, on each backend, batch and size.",

@@ -77,6 +77,7 @@ QUICK = [
     ("export --env sand-pushing --out e.h", "torch", "numpy"),
     ("explain PD612", WORKS, WORKS),
     ("universe 7", WORKS, WORKS),
+    ("schema", WORKS, WORKS),
 ]
 SLOW = [
     ("check sand-pushing", WORKS, WORKS),
