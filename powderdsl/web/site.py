@@ -6,12 +6,16 @@ The server listens on loopback: only GET, only files of the site, only for pages
 from __future__ import annotations
 
 import base64
+import gzip
 import hashlib
+import html
 import io
 import json
 import re
 import shutil
+import struct
 import zipfile
+import zlib
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
@@ -66,7 +70,10 @@ TYPES = {
 }
 
 SIZES = (64, 128, 256, 512)
-LIBRARIES = ("click", "lark", "pyyaml")
+PACKED = frozenset({"css", "html", "js", "json", "mjs", "svg", "txt", "wasm"})
+"""Kinds of files that are sent compressed."""
+
+LIBRARIES = ("lark", "pyyaml")
 """Python packages that the compiler needs in Pyodide."""
 
 
@@ -173,8 +180,9 @@ def _row(entry: Entry) -> dict[str, Any]:
 
 
 def _files_of(entry: Entry, sizes: list[Size], memo: Memo) -> dict[str, Make]:
-    """The files about some rules: a sheet, and a module for each size."""
+    """The files about some rules: a sheet, a picture, and a module for each size."""
     makers: dict[str, Make] = {f"rules/{entry.key}.json": lambda: _dump(_sheet(entry))}
+    makers[f"rules/{entry.key}.png"] = lambda: _picture(_sheet(entry), entry.ruleset)
     for size in sizes:
         module = partial(lambda size: standalone_module(entry.ruleset, size, memo), size)
         makers[f"rules/{entry.key}-{size[0]}x{size[1]}.wasm"] = module
@@ -198,11 +206,32 @@ def _sheet(entry: Entry) -> dict[str, Any]:
     }
 
 
-class Site:
-    """All files of the page, made on request. `first`: the rules that the page opens with."""
+def _picture(sheet: Mapping[str, Any], ruleset: Ruleset) -> bytes:
+    """A PNG of the world that shows the rules best."""
+    world = next(world for world in sheet["worlds"] if world["name"] == sheet["shown"])
+    rows, columns, ids = world["rows"], world["columns"], base64.b64decode(world["ids"])
+    lines = b"".join(b"\0" + ids[start : start + columns] for start in range(0, rows * columns, columns))
+    colors = {element.id: element.color for element in ruleset.elements}
+    chunks = {
+        b"IHDR": struct.pack(">IIBBBBB", columns, rows, 8, 3, 0, 0, 0),
+        b"PLTE": bytes.fromhex("".join(colors.get(id, "#000000")[1:] for id in range(256))),
+        b"IDAT": zlib.compress(lines, 9),
+        b"IEND": b"",
+    }
+    words = [(len(data), kind + data, zlib.crc32(kind + data)) for kind, data in chunks.items()]
+    return b"\x89PNG\r\n\x1a\n" + b"".join(
+        struct.pack(">I", length) + text + struct.pack(">I", check) for length, text, check in words
+    )
 
-    def __init__(self, first: Entry | None = None):
-        self.first = first
+
+class Site:
+    """All files of the page, made on request.
+
+    `first`: the rules that the page opens with. `offline`: for a host elsewhere, where a service worker keeps the files.
+    """
+
+    def __init__(self, first: Entry | None = None, *, offline: bool = False):
+        self.first, self.offline = first, offline
 
     @cached_property
     def rows(self) -> list[dict[str, Any]]:
@@ -224,11 +253,35 @@ class Site:
                     makers[prefix + path.relative_to(folder).as_posix()] = path.read_bytes
         makers["index.html"], makers["python.zip"] = index_page, python_archive
         makers["licenses.txt"] = licenses
+        worker, landing = makers.pop("sw.js"), makers.pop("landing.html")
         makers |= shipped_files()
         if self.first is not None and not (self.first.is_shipped and self.start in makers):
             own = _files_of(self.first, self.rows[0]["sizes"], Memo())
             makers |= {path: cache(make) for path, make in own.items()}
-        return makers | {"catalog.json": lambda: _dump({"format": 1, "rules": self.rows})}
+        catalog = {"format": 1, "rules": self.rows, "offline": self.offline}
+        makers["catalog.json"] = lambda: _dump(catalog)
+        if self.offline:
+            makers["play.html"], makers["index.html"] = index_page, lambda: self._landing(landing().decode())
+            makers["sw.js"] = lambda: self._worker(worker().decode())
+        return makers
+
+    def _landing(self, text: str) -> bytes:
+        """The first page of a site elsewhere, with a card for each of the rules."""
+        cards = [
+            f'<a class="card" href="play.html?rules={row["key"]}"><img src="rules/{row["key"]}.png" alt="" loading="lazy">'
+            f"<strong>{row['key']}</strong><small>{html.escape(row['about'])}</small></a>"
+            for row in self.rows
+        ]
+        return text.replace("<!-- cards -->", "\n".join(cards)).encode()
+
+    def _worker(self, text: str) -> bytes:
+        """The service worker. It keeps the files of a visit, and those about other rules once they are opened."""
+        first = {self.start, f"rules/{self.rows[0]['key']}.json"}
+        lazy = re.compile(r"rules/|parts/licenses/|licenses\.txt|sw\.js")
+        kept = [name for name in self.files if name in first or not lazy.match(name)]
+        hashes = {name: hashlib.sha256(self.files[name]()).hexdigest()[:16] for name in kept}
+        version = hashlib.sha256(_dump([text, hashes, code_version()])).hexdigest()[:16]
+        return text.replace('"VERSION"', f'"{version}"').replace('"FILES"', _dump(hashes).decode()).encode()
 
     @property
     def start(self) -> str:
@@ -242,10 +295,18 @@ class Site:
         return None if make is None else make()
 
     def write(self, folder: Path) -> int:
-        """Write all files, and return their number. Raises CompileError (PD613) if a file cannot be written."""
+        """Write all files, compressed ones beside them, and return their number.
+
+        Raises CompileError (PD613) if a file cannot be written.
+        """
+        count = 0
         for name, make in self.files.items():
-            _write(folder / name, make())
-        return len(self.files)
+            data = make()
+            packed = pack(name, data)
+            for path, content in [(name, data)] + [(f"{name}.gz", packed)] * (packed is not data):
+                _write(folder / path, content)
+                count += 1
+        return count
 
 
 class SiteServer(ThreadingHTTPServer):
@@ -282,13 +343,27 @@ class _Handler(BaseHTTPRequestHandler):
             return
         if data is None:
             self._answer(HTTPStatus.NOT_FOUND, b"no such file", "txt")
-        else:
-            self._answer(HTTPStatus.OK, data, path.rpartition(".")[2])
+            return
+        tag = f'"{hashlib.sha256(data).hexdigest()[:24]}"'
+        headers = {"ETag": tag, "Vary": "Accept-Encoding"}
+        if tag in self.headers.get("If-None-Match", ""):
+            self._answer(HTTPStatus.NOT_MODIFIED, b"", "txt", headers)
+            return
+        if "gzip" in self.headers.get("Accept-Encoding", ""):
+            packed = persistent(f"gzip {path}", tag, partial(pack, path, data))
+            headers |= {"Content-Encoding": "gzip"} if packed != data else {}
+            data = packed
+        self._answer(HTTPStatus.OK, data, path.rpartition(".")[2], headers)
 
-    def _answer(self, status: HTTPStatus, data: bytes, suffix: str) -> None:
+    def _answer(
+        self, status: HTTPStatus, data: bytes, suffix: str, headers: Mapping[str, str] | None = None
+    ) -> None:
         self.send_response(status)
         self.send_header("Content-Type", TYPES.get(suffix, "text/plain; charset=utf-8"))
-        self.send_header("Content-Length", str(len(data)))
+        if status != HTTPStatus.NOT_MODIFIED:
+            self.send_header("Content-Length", str(len(data)))
+        for name, value in (headers or {}).items():
+            self.send_header(name, value)
         self.send_header("Cache-Control", "no-cache")
         self.send_header("X-Content-Type-Options", "nosniff")
         self.end_headers()
@@ -305,6 +380,12 @@ def _write(path: Path, data: bytes) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     with replacing(path) as temporary:
         temporary.write_bytes(data)
+
+
+def pack(name: str, data: bytes) -> bytes:
+    """A file compressed by gzip, or as it is if that gains nothing."""
+    packed = gzip.compress(data, mtime=0) if name.rpartition(".")[2] in PACKED else data
+    return packed if len(packed) < len(data) else data
 
 
 def index_page() -> bytes:
@@ -360,6 +441,8 @@ def licenses() -> bytes:
 
 
 ABSENT = (
+    "cli",
+    "ogbench",
     "envs",
     "datasets",
     "rl",
@@ -370,7 +453,7 @@ ABSENT = (
     "web/parts",
     "web/made",
 )
-"""Parts of powderdsl that Pyodide does not need: those that require torch, and the page itself."""
+"""Parts of powderdsl that Pyodide does not need: the command line, what requires torch, and the page itself."""
 
 
 @cache

@@ -2,6 +2,7 @@
 import { cpSync, existsSync, mkdirSync, readFileSync, rmSync, writeFileSync } from "node:fs";
 import { dirname, join } from "node:path";
 import { fileURLToPath } from "node:url";
+import { build } from "esbuild";
 
 const here = dirname(fileURLToPath(import.meta.url));
 const modules = join(here, "node_modules");
@@ -49,6 +50,19 @@ for (const [name, note] of Object.entries(NOTES)) {
   const license = readFileSync(join(here, "licenses", `${name}.txt`), "utf8");
   writeFileSync(join(parts, "licenses", `${name}.txt`), `${note}\n\n${license}`);
 }
+
+// The editor is one file: what of CodeMirror the page imports, by the names of its packages.
+const packages = DISTRIBUTED.filter((name) => !/yaml$|streamparser|common|lr$/.test(name) || name === "@codemirror/lang-yaml");
+await build({
+  stdin: { contents: packages.map((name) => `export * from "${name}";`).join("\n"), resolveDir: here },
+  outfile: join(parts, "editor.js"),
+  bundle: true,
+  minify: true,
+  format: "esm",
+  target: "es2022",
+  legalComments: "none", // licenses.txt has them
+});
+
 versions.splice(1, 0, `python ${python}, PSF-2.0`);
 for (const file of PYODIDE) cpSync(join(modules, "pyodide", file), join(parts, "pyodide", file));
 writeFileSync(join(parts, "licenses", "README.txt"), `${versions.join("\n")}\n`);

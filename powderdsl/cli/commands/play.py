@@ -55,7 +55,7 @@ def command(
             drawn = first_world_data(begin(ruleset, world, None, None, None))
             start = {"name": Path(world).name, "about": "", **drawn}
         first = Entry(key, (rules,), settings, start)
-    site = Site(first)
+    site = Site(first, offline=export is not None)
     if export is not None:
         click.echo(f"{export}: {site.write(export)} files")
     else:

@@ -2,7 +2,7 @@
 
 import { $, failed, get } from "./dom.js";
 import { addWorlds, chooseRules, openRules, resize, startWorld } from "./opening.js";
-import { layout, newPainter, refresh, setRunning } from "./stage.js";
+import { layout, newPainter, picture, refresh, setRunning } from "./stage.js";
 import { app } from "./state.js";
 import { restore } from "./store.js";
 import { arrows, showPanel } from "./tabs.js";
@@ -19,6 +19,8 @@ const KEYS = {
   w: () => setTool("wind"),
   v: () => setTool("field"),
   t: () => setTool("look"),
+  m: () => app.record?.().catch(failed),
+  "?": () => $("keys").showModal(),
   "[": () => setBrush(app.brush.size - 1),
   "]": () => setBrush(app.brush.size + 1),
 };
@@ -42,6 +44,7 @@ function key(event) {
 }
 
 function attach() {
+  $("keys-button").onclick = () => $("keys").showModal();
   $("run").onclick = () => setRunning(!app.running);
   $("step").onclick = stepOnce;
   $("reset").onclick = reset;
@@ -68,22 +71,43 @@ function attach() {
   new ResizeObserver(() => app.engine && layout()).observe($("frame"));
 }
 
+/** Lets a new version of the site take over, which the service worker fetched during an earlier visit. */
+async function renew() {
+  const waiting = (await navigator.serviceWorker?.getRegistration())?.waiting;
+  if (!waiting) return;
+  const changed = new Promise((resolve) => navigator.serviceWorker.addEventListener("controllerchange", () => resolve(true)));
+  waiting.postMessage("replace");
+  if (!(await Promise.race([changed, new Promise((resolve) => setTimeout(resolve, 1500))]))) return;
+  location.reload();
+  await new Promise(() => {});
+}
+
 async function begin() {
+  await renew().catch(() => {}); // frames may be refused
+  const full = new URL(location.href);
+  const asked = full.searchParams;
+  const embedded = asked.has("embed");
+  document.body.classList.toggle("embed", embedded);
+  asked.delete("embed");
+  $("full").href = full.href;
   attach();
   setTool("brush");
   setBrush(5);
   setSpeed(SPEEDS.indexOf(app.speed));
   showPanel("rules-panel");
   app.catalog = await (await get("catalog.json")).json();
-  const [first] = app.catalog.rules;
-  app.isBack = await restore().catch((error) => console.info(`powderdsl: ${error}`));
+  const first = app.catalog.rules.find((one) => one.key === asked.get("rules")) ?? app.catalog.rules[0];
+  const isNew = embedded || asked.has("rules");
+  app.isBack = !isNew && (await restore().catch((error) => console.info(`powderdsl: ${error}`)));
   if (!app.isBack) await openRules(first.key, { size: first.sizes[0].join("x") });
   app.firstWorld = performance.now();
   // The rest comes after the first picture: the editor, and Python in a worker.
-  await import("./panels.js");
-  await import("./rules.js");
+  await picture();
+  if (embedded && !location.hash) return;
+  await Promise.all([import("./panels.js"), import("./rules.js")]);
   await Promise.all([import("./exchange.js"), import("./checks.js")]);
   await addWorlds(await (await get("tasks.json")).json());
+  if (app.catalog.offline) navigator.serviceWorker?.register("sw.js").catch(() => {}); // private windows may refuse
 }
 
 globalThis.powderdsl = app; // for tests and for people who look at the page's console

@@ -6,6 +6,7 @@ import { openWork, openWorld } from "./opening.js";
 import { addFile, addRuleset, isRuleset, rules } from "./rules.js";
 import { fromFragment, toFragment } from "./share.js";
 import { listedRules, sheetOf } from "./shipped.js";
+import { refresh, setRunning } from "./stage.js";
 import { app } from "./state.js";
 import { missing, webm } from "./video.js";
 import { changedParameters } from "./work.js";
@@ -13,7 +14,7 @@ import { readWorld, text, writeWorld } from "./worlds.js";
 
 const MAX_FILE = 32 << 20;
 const recorder = new Recorder();
-app.drawn = (image) => recorder.add(image);
+app.drawn = (draw) => recorder.add(draw);
 app.recorder = recorder;
 
 /** The files that differ from the site's; null for a file of the site that is gone. */
@@ -99,6 +100,17 @@ async function saveFilm(make, name) {
   say(`${name} is saved.`);
 }
 
+/** Begins a recording, or ends one and saves it: as a video where the browser can. */
+app.record = async () => {
+  const on = recorder.toggle();
+  $("record").textContent = on ? "End the recording (M)" : "Record (M)";
+  if (on) {
+    setRunning(true);
+    say("Recording. Press M to end and save it.");
+  } else if (await missing()) await saveFilm(gif, "world.gif");
+  else await saveFilm(webm, "world.webm");
+};
+
 /** Opens files that were dropped or chosen, together. */
 async function openAll(list) {
   const texts = {};
@@ -135,7 +147,8 @@ on("share", share);
 on("save-world", saveWorld);
 on("save-pack", () => download(new Blob([rules.files[rules.shown]], { type: "text/yaml" }), rules.shown));
 on("save-rules", saveRules);
-on("save-png", async () => download(await png($("canvas")), "world.png"));
+on("save-png", async () => download(await png(app.painter.draw($("tint").checked)), "world.png"));
+on("record", app.record);
 on("save-gif", () => saveFilm(gif, "world.gif"));
 on("save-webm", () => saveFilm(webm, "world.webm"));
 $("save").addEventListener("toggle", () => $("save").open && showEntries().catch(failed));

@@ -2,26 +2,35 @@
 
 const MOST_FRAMES = 120;
 const BUDGET = 32 << 20; // bytes of frames that are kept
+const LONGER = 8; // times as much for recordings that somebody has begun
 const EVERY = 50; // ms between frames
 
-/** Keeps the last seconds, with 15 bits a pixel. */
+/** Keeps the last seconds, or all since a recording began, with 15 bits a pixel. */
 export class Recorder {
   constructor() {
+    this.recording = false;
     this.clear();
+  }
+
+  /** Begins a recording or ends one. Returns whether one runs. */
+  toggle() {
+    this.recording = !this.recording;
+    if (this.recording) this.clear();
+    return this.recording;
   }
 
   clear() {
     /** @type {Uint16Array[]} */ this.frames = [];
     this.last = -Infinity;
-    /** The picture that is shown, if it came too soon after the last frame. @type {ImageData | null} */ this.skipped = null;
+    /** Draws the picture that is shown, if it came too soon after the last frame. */ this.skipped = null;
   }
 
-  /** @param {ImageData} image */
-  add(image, now = performance.now()) {
-    this.skipped = now - this.last < EVERY ? image : null;
+  /** @param {() => ImageData} draw */
+  add(draw, now = performance.now()) {
+    this.skipped = now - this.last < EVERY ? draw : null;
     if (this.skipped) return;
     this.last = now;
-    this._keep(image);
+    this._keep(draw());
   }
 
   _keep(image) {
@@ -34,14 +43,15 @@ export class Recorder {
       frame[i] = ((color & 0xf8) << 7) | ((color >> 6) & 0x3e0) | ((color >> 19) & 31);
     }
     this.frames.push(frame);
-    const most = Math.max(2, Math.min(MOST_FRAMES, Math.floor(BUDGET / frame.byteLength)));
+    const longer = this.recording ? LONGER : 1;
+    const most = Math.max(2, longer * Math.min(MOST_FRAMES, Math.floor(BUDGET / frame.byteLength)));
     if (this.frames.length > most) this.frames.shift();
   }
 
   /** The frames that are there now; `every` is the ms between them. */
   kept() {
     // An animation ends with the picture that is shown.
-    if (this.skipped) this._keep(this.skipped);
+    if (this.skipped) this._keep(this.skipped());
     this.skipped = null;
     const { rows, columns, frames } = this;
     if (frames.length < 2) throw new Error("Run the world first: there are no frames yet.");
@@ -168,14 +178,14 @@ function compressed(symbols) {
   return Uint8Array.from(found);
 }
 
-/** @param {HTMLCanvasElement} canvas @returns {Promise<Blob>} a PNG, small worlds enlarged */
-export function png(canvas) {
-  const factor = Math.max(1, Math.floor(512 / Math.max(canvas.width, canvas.height)));
+/** @param {ImageData} image @returns {Promise<Blob>} a PNG, small worlds enlarged */
+export async function png(image) {
+  const factor = Math.max(1, Math.floor(512 / Math.max(image.width, image.height)));
   const large = document.createElement("canvas");
-  [large.width, large.height] = [canvas.width * factor, canvas.height * factor];
+  [large.width, large.height] = [image.width * factor, image.height * factor];
   const context = large.getContext("2d");
   context.imageSmoothingEnabled = false;
-  context.drawImage(canvas, 0, 0, large.width, large.height);
+  context.drawImage(await createImageBitmap(image), 0, 0, large.width, large.height);
   return new Promise((resolve) => large.toBlob(resolve, "image/png"));
 }
 

@@ -4,7 +4,7 @@ import { blindColors } from "./colors.js";
 import { $ } from "./dom.js";
 import { clearChart, showReadings } from "./readings.js";
 import { app } from "./state.js";
-import { Painter } from "./view.js";
+import { Painter, Screen } from "./view.js";
 
 const STEP_BUDGET = 11; // ms of a frame that steps may take
 const CHECKPOINT_EVERY = 32; // steps of small worlds; fewer of large ones, which take longer to copy
@@ -13,6 +13,7 @@ const MOST_CHECKPOINTS = 8;
 let due = 0;
 let last = 0;
 let dirty = true;
+const screen = new Screen($("canvas"));
 
 /** Puts an engine in the place of the present one. Its world is whatever it holds. */
 export function use(engine) {
@@ -85,6 +86,18 @@ export function step() {
   engine.step(1);
 }
 
+/** Resolves when the first picture is on the screen. */
+export const picture = () =>
+  new Promise((resolve) => {
+    const shown = () => {
+      app.firstPicture ??= performance.now();
+      resolve();
+    };
+    // A page in the background draws nothing, and still loads.
+    requestAnimationFrame(() => requestAnimationFrame(shown));
+    setTimeout(shown, 500);
+  });
+
 function frame(now) {
   requestAnimationFrame(frame);
   app.frames++;
@@ -93,8 +106,9 @@ function frame(now) {
   for (const one of app.onFrame) one();
   if (dirty) {
     dirty = false;
-    $("canvas").getContext("2d").putImageData(app.painter.draw($("tint").checked), 0, 0);
-    app.drawn?.(app.painter.image);
+    const tint = $("tint").checked;
+    screen.show(app.painter, tint);
+    app.drawn?.(() => app.painter.draw(tint));
     const [, , step] = app.engine.clock();
     $("clock").textContent = `step ${step}`;
     showReadings(now);

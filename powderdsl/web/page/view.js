@@ -82,6 +82,107 @@ export class Painter {
   }
 }
 
+const CORNERS = `#version 300 es
+void main() { gl_Position = vec4(ivec2(gl_VertexID & 1, gl_VertexID >> 1) * 4 - 1, 0, 1); }`;
+const CELLS = `#version 300 es
+precision highp float;
+precision highp sampler2D;
+precision highp usampler2D;
+uniform usampler2D ids;
+uniform sampler2D colors, vectors; // of elements; the rows of one component, then those of the other
+uniform bool drawn, tints; // drawn: colors are those of cells
+uniform vec3 shares;
+uniform float full, most;
+out vec4 pixel;
+void main() {
+  int rows = textureSize(ids, 0).y;
+  ivec2 at = ivec2(int(gl_FragCoord.x), rows - 1 - int(gl_FragCoord.y));
+  vec3 color = texelFetch(colors, drawn ? at : ivec2(texelFetch(ids, at, 0).r, 0), 0).rgb;
+  vec2 vector = tints ? vec2(texelFetch(vectors, at, 0).r, texelFetch(vectors, at + ivec2(0, rows), 0).r) : vec2(0);
+  if (vector != vec2(0)) {
+    float share = min(sqrt(vector.x * vector.x + vector.y * vector.y) / full, most);
+    color = floor((color * (1.0 - share) + share * shares) * 255.0) / 255.0;
+  }
+  pixel = vec4(color, 1);
+}`;
+
+/** Whether there is a GPU: WebGL that runs on the processor is slower than a 2D canvas. */
+function accelerated() {
+  const gl = document.createElement("canvas").getContext("webgl2", { failIfMajorPerformanceCaveat: true });
+  const name = gl?.getParameter(gl.getExtension("WEBGL_debug_renderer_info")?.UNMASKED_RENDERER_WEBGL ?? gl.RENDERER);
+  gl?.getExtension("WEBGL_lose_context")?.loseContext();
+  return Boolean(gl) && !/swiftshader|llvmpipe|software|basic render/i.test(name);
+}
+
+/** Puts worlds on a canvas: by the GPU where there is one, otherwise as a Painter draws them. */
+export class Screen {
+  /** @param {HTMLCanvasElement} canvas */
+  constructor(canvas, fast = accelerated()) {
+    this.canvas = canvas;
+    this.gl = fast && canvas.getContext("webgl2", { alpha: false, antialias: false, depth: false });
+    if (this.gl) this._build();
+    canvas.addEventListener("webglcontextlost", (event) => event.preventDefault());
+    canvas.addEventListener("webglcontextrestored", () => {
+      this._build();
+      this.show(...this.shown);
+    });
+  }
+
+  _build() {
+    const { gl } = this;
+    const program = gl.createProgram();
+    for (const [type, text] of [[gl.VERTEX_SHADER, CORNERS], [gl.FRAGMENT_SHADER, CELLS]]) {
+      const shader = gl.createShader(type);
+      gl.shaderSource(shader, text);
+      gl.compileShader(shader);
+      gl.attachShader(program, shader);
+    }
+    gl.linkProgram(program);
+    gl.useProgram(program);
+    const names = ["ids", "colors", "vectors", "drawn", "tints", "shares", "full", "most"];
+    this.places = Object.fromEntries(names.map((name) => [name, gl.getUniformLocation(program, name)]));
+    gl.pixelStorei(gl.UNPACK_ALIGNMENT, 1);
+    names.slice(0, 3).forEach((name, unit) => {
+      gl.activeTexture(gl.TEXTURE0 + unit);
+      gl.bindTexture(gl.TEXTURE_2D, gl.createTexture());
+      for (const side of [gl.TEXTURE_MIN_FILTER, gl.TEXTURE_MAG_FILTER]) gl.texParameteri(gl.TEXTURE_2D, side, gl.NEAREST);
+      gl.uniform1i(this.places[name], unit);
+    });
+  }
+
+  /** @param {Painter} painter */
+  show(painter, tint) {
+    const { gl, places } = this;
+    if (!gl) {
+      this.canvas.getContext("2d").putImageData(painter.draw(tint), 0, 0);
+      return;
+    }
+    this.shown = [painter, tint];
+    const { engine, table } = painter;
+    const { rows, columns } = engine;
+    const put = (unit, inside, height, format, type, data, width = columns) => {
+      gl.activeTexture(gl.TEXTURE0 + unit);
+      gl.texImage2D(gl.TEXTURE_2D, 0, inside, width, height, 0, format, type, data);
+    };
+    const tinting = tint ? engine.fields.filter((one) => one.tint) : [];
+    const drawn = painter.ramps.length > 0 || tinting.length > 1;
+    put(0, gl.R8UI, rows, gl.RED_INTEGER, gl.UNSIGNED_BYTE, engine.ids());
+    if (drawn) put(1, gl.RGBA8, rows, gl.RGBA, gl.UNSIGNED_BYTE, new Uint8Array(painter.draw(tint).data.buffer));
+    else put(1, gl.RGBA8, 1, gl.RGBA, gl.UNSIGNED_BYTE, new Uint8Array(table.buffer), 256);
+    gl.uniform1i(places.drawn, Number(drawn));
+    gl.uniform1i(places.tints, Number(!drawn && tinting.length));
+    if (!drawn && tinting.length) {
+      const { color, full, most } = tinting[0].tint;
+      put(2, gl.R32F, 2 * rows, gl.RED, gl.FLOAT, engine.field(engine.fields.indexOf(tinting[0])));
+      gl.uniform3fv(places.shares, channels(color).map((part) => part / 255));
+      gl.uniform1f(places.full, full);
+      gl.uniform1f(places.most, most);
+    }
+    gl.viewport(0, 0, columns, rows);
+    gl.drawArrays(gl.TRIANGLES, 0, 3);
+  }
+}
+
 const random = generator(Date.now());
 
 /**

@@ -1,0 +1,95 @@
+"""Visits of an exported site in headless Chromium: what they fetch, and what visitors see."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Iterator
+from functools import partial
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from threading import Thread
+from typing import Any
+
+import pytest
+
+from powderdsl.web import site as site_module
+from powderdsl.web.site import Entry, Site
+from tests.web.test_page import HERE, needed
+from tests.wheels import succeed
+
+pytestmark = pytest.mark.slow
+
+MOST = 8_400_000
+"""Bytes of a first visit, all that the compiler needs included."""
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A site with two rulesets."""
+    if words := needed():
+        pytest.skip(words)
+    made = tmp_path_factory.mktemp("exported")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(site_module, "SIZES", (64,))
+        entries = [Entry(name, (name,)) for name in ("powderworld", "life")]
+        patch.setattr(site_module, "shipped_entries", lambda: entries)
+        patch.setattr(site_module, "code_version", lambda: "of a test")
+        patch.setenv("XDG_CACHE_HOME", str(made))
+        Site(offline=True).write(made / "site")
+    return made / "site"
+
+
+class Quiet(SimpleHTTPRequestHandler):
+    def log_message(self, *_: object) -> None:
+        pass
+
+
+@pytest.fixture(scope="module")
+def seen(folder: Path) -> Iterator[dict[str, Any]]:
+    """What views.mjs saw."""
+    server = ThreadingHTTPServer(("127.0.0.1", 0), partial(Quiet, directory=str(folder)))
+    Thread(target=server.serve_forever, daemon=True).start()
+    address = f"http://127.0.0.1:{server.server_port}/"
+    try:
+        yield json.loads(succeed(str(shutil.which("node")), HERE / "views.mjs", address, folder, cwd=folder))
+    finally:
+        server.shutdown()
+        server.server_close()
+
+
+def test_a_second_visit_needs_no_network(folder: Path) -> None:
+    found = json.loads(succeed(str(shutil.which("node")), HERE / "visit.mjs", folder, cwd=folder))
+    assert found["first"]["bytes"] <= MOST
+    # The browser itself asks whether there is a new service worker.
+    assert set(found["second"]["paths"]) <= {"/sw.js"}
+    assert found["offline"]["ready"] > 0
+    # A new version replaces the old one at the next visit, and only its files are kept.
+    assert found["replaced"] == {"texts": ["old", "new"], "caches": 1}
+    assert found["problems"] == []
+
+
+def test_the_landing_page_opens_rules(seen: dict[str, Any]) -> None:
+    assert (seen["cards"], seen["opened"]) == (["powderworld", "life"], "life")
+
+
+def test_an_embedded_world_has_a_button_and_a_link(seen: dict[str, Any]) -> None:
+    found = seen["embedded"]
+    assert (found["shown"], found["editor"]) == (["Pause", "Open in the playground"], False)
+    assert found["link"] == "play.html?rules=life"
+
+
+def test_the_gpu_draws_the_same_pixels(seen: dict[str, Any]) -> None:
+    assert seen["pixels"].pop("colors") > 100
+    assert seen["pixels"] == {"tinted": 0, "plain": 0, "ramped": 0, "without": False}
+
+
+def test_one_key_records(seen: dict[str, Any], folder: Path) -> None:
+    assert "record a video" in seen["keys"]
+    assert seen["closed"]
+    assert seen["recording"] == [True, "Recording. Press M to end and save it."]
+    assert (folder / "film.webm").read_bytes()[:4] == b"\x1aE\xdf\xa3"
+
+
+def test_nothing_fails(seen: dict[str, Any]) -> None:
+    assert seen["problems"] == []
