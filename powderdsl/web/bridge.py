@@ -184,7 +184,7 @@ class Session:
         return rows
 
     def tests(self, pack: str) -> list[dict[str, Any]]:
-        """The tests of a pack: the place of each, and the problem and the world if it failed."""
+        """The tests of a pack: the place of each, its worlds, and the problem and the world then if it failed."""
         from powderdsl.testing.pack_tests.runner import run_examples
 
         rules = self._rules()
@@ -195,6 +195,8 @@ class Session:
                 "passed": result.passed,
                 "problem": result.problem,
                 "step": result.step,
+                "given": list(result.example.given),
+                "expect": list(result.example.expect or ()),
                 "after": list(result.after),
                 "legend": dict(result.example.legend),
                 "place": result.example.span.place.rpartition("/")[2],

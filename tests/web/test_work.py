@@ -87,3 +87,25 @@ def test_work_is_kept(address: str, tmp_path: Path) -> None:
     assert (found["wentBack"], found["fromList"], found["undoneLink"]) == (True, True, "life")
     assert "powderworld, sand.yaml" in found["recent"]
     assert "is back" in found["newTab"]
+
+
+def test_files_links_and_tests(address: str, tmp_path: Path) -> None:
+    found = script("files.mjs", address, tmp_path, str(tmp_path))
+    assert found["replaced"] == ["red.yaml is replaced. Undo", True, False]
+    assert found["mine"] == ["mine.yaml", *(f"mine{number}.yaml" for number in range(2, 11))]
+    assert found["renamed"] == [["dust.yaml", "dust2.yaml"], "pack: dust2"]
+    assert found["deleted"] == ["dust2.yaml is deleted. Undo", "dust.yaml", "dust2.yaml"]
+    assert found["taken"] == "There is a red.yaml already."
+    assert found["typed"] == ["ashes.yaml", "ashes"]
+    assert found["figures"] == [[name, 4, 4, 3] for name in ("given", "expected", "got, step 20")]
+    assert found["lab"] == ["core.yaml", "sand.yaml", "water.yaml", "lab.yaml"]
+    assert found["added"] == [*found["lab"], "zzz.yaml"]
+    assert found["left"]
+    exact, rounded, refused = found["links"]
+    assert "Fields are rounded" not in exact
+    assert "Fields are rounded" in rounded
+    assert "30,000 at most" in refused
+    assert (found["sameLink"], found["sameFile"]) == (True, True)
+    assert found["hash"] < 30_000
+    assert "my.npz" in found["message"]
+    assert "/tmp" not in found["message"]

@@ -1,6 +1,6 @@
 // What the compiler knows about the rules: the ledger, invariants, tests; and why a cell changed.
 
-import { $, make, report, say } from "./dom.js";
+import { $, failed, make, report } from "./dom.js";
 import { Engine } from "./engine.js";
 import { rules } from "./rules.js";
 import { setRunning } from "./stage.js";
@@ -10,21 +10,12 @@ import { writeWorld } from "./worlds.js";
 
 const packOf = (file) => file.replace(/\.ya?ml$/, "");
 
-const why = make("div");
-const ledger = make("div");
-const invariants = make("div");
-const tests = make("div");
+const [why, ledger, invariants, tests] = [1, 2, 3, 4].map(() => make("div"));
 const button = (label, action) => {
   const found = make("button", { type: "button" }, label);
-  found.onclick = async () => {
+  found.onclick = () => {
     found.disabled = true;
-    try {
-      await action();
-    } catch (error) {
-      say(String(error.message ?? error), true);
-    } finally {
-      found.disabled = false;
-    }
+    action().catch(failed).finally(() => (found.disabled = false));
   };
   return found;
 };
@@ -55,41 +46,32 @@ const runTests = button("Run the tests of the shown pack", async () => {
     const mark = make("span", { class: one.passed ? "good" : "bad" }, one.passed ? "✓ " : "✗ ");
     const line = make("p", {}, mark, one.name, make("span", { class: "soft" }, `  ${one.place}`));
     if (one.passed) return line;
-    const text = make("p", { class: "bad" }, one.problem);
-    return make("div", {}, line, text, one.after.length ? picture(one.after, one.legend) : "");
+    const worlds = [["given", one.given], ["expected", one.expect], [`got, step ${one.step}`, one.after]];
+    const drawn = worlds.filter(([, lines]) => lines.length).map(([name, lines]) => picture(name, lines, one.legend));
+    return make("div", {}, line, make("p", { class: "bad" }, one.problem), make("div", { class: "row" }, ...drawn));
   });
   tests.replaceChildren(...(shown.length ? shown : [make("p", { class: "soft" }, `${pack} has no tests.`)]));
 });
 
-/** A world of a test, drawn from its characters. */
-function picture(lines, legend) {
-  const rows = lines.map((line) => line.trim().split(/\s+/));
-  const canvas = make("canvas", { class: "failed", width: rows[0].length, height: rows.length });
+/** A world of a test, drawn from its characters; `?` is any element. */
+function picture(name, lines, legend) {
+  const [rows, columns] = [lines.length, Math.max(...lines.map((line) => line.length))];
+  const canvas = make("canvas", { class: "failed", width: columns, height: rows, role: "img", "aria-label": `${name}:\n${lines.join("\n")}` });
   const context = canvas.getContext("2d");
-  rows.forEach((row, y) =>
-    row.forEach((char, x) => {
+  lines.forEach((line, y) =>
+    [...line].forEach((char, x) => {
       const element = app.engine.elements.find((one) => [one.name, one.qualified].includes(legend[char]));
       context.fillStyle = app.colors.get(element?.id) ?? "#888";
       context.fillRect(x, y, 1, 1);
     }),
   );
-  canvas.style.width = `${rows[0].length * 18}px`;
-  return make("div", {}, canvas, report(lines.join("\n")));
+  canvas.style.width = `${columns * Math.min(18, Math.max(4, Math.floor(160 / columns)))}px`;
+  return make("figure", {}, canvas, make("figcaption", { class: "soft" }, name));
 }
 
-$("checks").replaceChildren(
-  make("h2", {}, "Why a cell changed"),
-  why,
-  make("h2", {}, "Ledger: what rules create, destroy and conserve"),
-  showLedger,
-  ledger,
-  make("h2", {}, "Invariants"),
-  tryInvariants,
-  invariants,
-  make("h2", {}, "Tests"),
-  runTests,
-  tests,
-);
+const parts = { "Why a cell changed": [why], "Ledger: what rules create, destroy and conserve": [showLedger, ledger] };
+Object.assign(parts, { Invariants: [tryInvariants, invariants], Tests: [runTests, tests] });
+$("checks").replaceChildren(...Object.entries(parts).flatMap(([title, nodes]) => [make("h2", {}, title), ...nodes]));
 why.replaceChildren(make("p", { class: "soft" }, "Choose Explain, then a cell of the world."));
 rules.onApplied.push(() => {
   for (const one of [ledger, invariants, tests]) one.replaceChildren();

@@ -7,17 +7,8 @@ import { HighlightStyle, bracketMatching, indentOnInput, syntaxHighlighting } fr
 import { lintGutter, setDiagnostics } from "@codemirror/lint";
 import { highlightSelectionMatches, searchKeymap } from "@codemirror/search";
 import { EditorState, StateEffect } from "@codemirror/state";
-import {
-  Decoration,
-  EditorView,
-  MatchDecorator,
-  ViewPlugin,
-  drawSelection,
-  highlightActiveLine,
-  highlightActiveLineGutter,
-  keymap,
-  lineNumbers,
-} from "@codemirror/view";
+import { Decoration, EditorView, MatchDecorator, ViewPlugin, drawSelection, keymap, lineNumbers } from "@codemirror/view";
+import { highlightActiveLine, highlightActiveLineGutter } from "@codemirror/view";
 import { tags } from "@lezer/highlight";
 
 const STYLE = HighlightStyle.define([
@@ -120,16 +111,8 @@ export class Editor {
     return EditorState.create({
       doc,
       extensions: [
-        lineNumbers(),
-        lintGutter(),
-        history(),
-        drawSelection(),
-        highlightActiveLine(),
-        highlightActiveLineGutter(),
-        highlightSelectionMatches(),
-        indentOnInput(),
-        bracketMatching(),
-        closeBrackets(),
+        [lineNumbers(), lintGutter(), history(), drawSelection(), highlightActiveLine(), highlightActiveLineGutter()],
+        [highlightSelectionMatches(), indentOnInput(), bracketMatching(), closeBrackets()],
         autocompletion({ override: [complete] }),
         yaml(),
         syntaxHighlighting(STYLE),

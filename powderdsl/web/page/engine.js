@@ -272,17 +272,11 @@ export class History {
     return (way === "undo" ? this.past : this.future).at(-1);
   }
 
-  /** The moment before the last change, in exchange for the present one. */
-  undo(present) {
-    const found = this.past.pop();
-    if (found) this.future.push(present);
-    return found;
-  }
-
-  redo(present) {
-    const found = this.future.pop();
-    if (found) this.past.push(present);
-    return found;
+  /** Goes there, in exchange for the present moment. */
+  go(way, present) {
+    const [from, to] = way === "undo" ? [this.past, this.future] : [this.future, this.past];
+    from.pop();
+    to.push(present);
   }
 }
 

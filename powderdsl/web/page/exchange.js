@@ -4,7 +4,7 @@ import { $, commandLine, failed, make, say } from "./dom.js";
 import { Recorder, download, gif, png } from "./media.js";
 import { openWork, openWorld } from "./opening.js";
 import { addFile, addRuleset, isRuleset, rules } from "./rules.js";
-import { fromFragment, toFragment } from "./share.js";
+import { MAX_SHARED, fromBytes, fromFragment, rounded, toBytes, toFragment } from "./share.js";
 import { listedRules, sheetOf } from "./shipped.js";
 import { refresh, setRunning } from "./stage.js";
 import { app } from "./state.js";
@@ -27,38 +27,50 @@ function changedFiles() {
   return Object.keys(found).length ? found : null;
 }
 
-export async function link() {
-  const shared = {
-    key: app.rules.key,
-    files: changedFiles(),
-    off: [...rules.off],
-    parameters: changedParameters(),
-    world: app.engine.snapshot(),
-  };
-  return location.href.split("#")[0] + (await toFragment(shared));
-}
+const present = () => {
+  const world = app.engine.snapshot();
+  return { key: app.rules.key, files: changedFiles(), off: [...rules.off], parameters: changedParameters(), world };
+};
 
 async function share() {
-  const address = await link();
+  const shared = present();
+  const start = location.href.split("#")[0];
+  const long = start + (await toFragment(shared));
+  const isLong = long.length > MAX_SHARED;
+  const address = isLong ? start + (await toFragment({ ...shared, world: rounded(shared.world) })) : long;
+  const count = (one) => one.length.toLocaleString("en");
+  if (address.length > MAX_SHARED) {
+    const button = make("button", { type: "button", class: "small", onclick: () => saveAll(shared).catch(failed) }, "Save world.powder");
+    const most = MAX_SHARED.toLocaleString("en");
+    say(`A link would have ${count(address)} characters; programs pass on ${most} at most. A file holds it all: `, true, button);
+    return;
+  }
   history.replaceState(history.state, "", new URL(address).hash);
   app.unsaved = true;
+  const words = isLong ? " Fields are rounded, so that it is short enough: the world may go on otherwise." : "";
   try {
     await navigator.clipboard.writeText(address);
-    say(`The link is copied: ${address.length.toLocaleString("en")} characters hold the rules and the world.`);
+    say(`The link is copied: ${count(address)} characters hold the rules and the world.${words}`);
   } catch {
-    say(`The address bar holds the link: ${address.length.toLocaleString("en")} characters.`);
+    say(`The address bar holds the link: ${count(address)} characters.${words}`);
   }
 }
+
+/** Saves what a link holds, of any size. */
+const saveAll = async (shared) => download(new Blob([await toBytes(shared)]), "world.powder");
 
 /** Opens what a link holds. */
 export async function openLink(fragment) {
   const shared = await fromFragment(fragment);
-  if (!shared) return false;
+  return shared !== null && openShared(shared, "This is the world of the link, paused.");
+}
+
+async function openShared(shared, words) {
   const { files: changed, key } = shared;
-  if (!listedRules(key)) throw new Error(`The link uses the rules ${key}, which this page does not have.`);
+  if (!listedRules(key)) throw new Error(`It uses the rules ${key}, which this page does not have.`);
   const files = changed && { ...(await sheetOf(key)).files, ...changed };
   for (const name of Object.keys(files ?? {})) if (files[name] === null) delete files[name];
-  return openWork({ ...shared, files }, { words: "This is the world of the link, paused." });
+  return openWork({ ...shared, files }, { words });
 }
 
 async function saveWorld() {
@@ -122,7 +134,7 @@ async function openAll(list) {
   }
   if (Object.values(texts).some(isRuleset)) addRuleset(texts);
   else for (const [name, text] of Object.entries(texts)) addFile(name, text);
-  for (const file of worlds) await openNpz(file);
+  for (const file of worlds) await openWorldFile(file);
 }
 
 function fileName(given) {
@@ -131,9 +143,11 @@ function fileName(given) {
   return name;
 }
 
-async function openNpz(file) {
+async function openWorldFile(file) {
   const data = new Uint8Array(await file.arrayBuffer());
-  const world = readWorld(await rules.compiler.call("open_world", text(data)));
+  if (/\.powder$/i.test(file.name)) return openShared(await fromBytes(() => data), `This is the world of ${file.name}, paused.`);
+  const reading = rules.compiler.call("open_world", text(data));
+  const world = readWorld(await reading.catch(({ message }) => Promise.reject(new Error(message.replace("opened.npz", file.name)))));
   if (await openWorld(world)) say(`${file.name}: ${world.rows}×${world.columns} cells, step ${world.clock[2]}`);
 }
 
@@ -144,6 +158,7 @@ const on = (id, action) =>
   });
 
 on("share", share);
+on("save-all", () => saveAll(present()));
 on("save-world", saveWorld);
 on("save-pack", () => download(new Blob([rules.files[rules.shown]], { type: "text/yaml" }), rules.shown));
 on("save-rules", saveRules);

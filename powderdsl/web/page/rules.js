@@ -84,9 +84,8 @@ function show(name) {
 }
 
 function showTabs() {
-  const bad = new Set(
-    rules.diagnostics.filter((one) => one.severity === "error").map((one) => one.primary.span?.file),
-  );
+  if (rules.naming) return; // a name is being typed
+  const bad = new Set(rules.diagnostics.filter((one) => one.severity === "error").map((one) => one.primary.span?.file));
   const tabs = Object.entries(rules.files).map(([name, text]) => {
     const pack = packOf(name);
     const classes = ["pack", name === rules.shown && "shown", bad.has(name) && "bad", rules.off.has(pack) && "off"];
@@ -106,7 +105,7 @@ function showTabs() {
     act("Duplicate", `Duplicate ${one}`, () => duplicate(one)),
     act("Delete", `Delete ${one} (Delete)`, () => removeFile(one)),
   ];
-  const add = make("button", { type: "button", title: "Add a pack of your own", onclick: addPack }, "+ pack");
+  const add = make("button", { type: "button", title: "Add a pack of your own", onclick: () => addPack() }, "+ pack");
   const focused = [...$("packs").querySelectorAll("button, input")].indexOf(document.activeElement);
   $("packs").replaceChildren(...tabs, add, make("span", { class: "row" }, ...acts));
   if (focused >= 0) [...$("packs").querySelectorAll("button, input")].at(focused)?.focus();
@@ -117,21 +116,23 @@ function askName(name) {
   const at = Object.keys(rules.files).indexOf(name);
   const field = make("input", { "aria-label": `Another name for ${packOf(name)}`, size: 12, maxlength: 60 });
   field.value = packOf(name);
-  field.onkeydown = (event) => {
-    if (event.key === "Enter") field.blur();
-    if (event.key !== "Escape") return;
-    field.value = packOf(name);
-    field.blur();
+  field.onkeydown = ({ key }) => {
+    if (key === "Escape") field.value = packOf(name);
+    if (key === "Escape" || key === "Enter") field.blur();
   };
   field.onblur = () => {
+    rules.naming = false;
     const pack = field.value.trim();
     if (pack !== packOf(name) && name in rules.files) renameFile(name, pack);
     showTabs();
     $("packs").children[at]?.querySelector("button")?.focus();
   };
+  rules.naming = true;
   $("packs").children[at].querySelector("button").replaceWith(field);
   field.select();
 }
+
+const withName = (text, pack) => text.replace(/^(pack|ruleset): *\w+/m, `$1: ${pack}`);
 
 /** Renames a file, and the pack or ruleset that it declares. */
 function renameFile(name, pack) {
@@ -139,28 +140,17 @@ function renameFile(name, pack) {
   if (!/^[A-Za-z_]\w{0,59}$/.test(pack)) return say(`“${pack}” is no name: letters, digits and _, no digit first`, true);
   if (fresh in rules.files) return say(`There is a ${fresh} already.`, true);
   remember([name, fresh]);
-  const text = rules.files[name];
   move(name, fresh);
-  setText(fresh, text.replace(/^(pack|ruleset): *\w+/m, `$1: ${pack}`));
-  edited();
+  exchange({ [fresh]: withName(rules.files[fresh], pack) });
 }
 
 /** Gives a file another name; its place and the editor's undo stay. */
 function move(name, fresh) {
-  const renamed = ([one, text]) => [one === name ? fresh : one, text];
-  rules.files = Object.fromEntries(Object.entries(rules.files).map(renamed));
+  rules.files = Object.fromEntries(Object.entries(rules.files).map(([one, text]) => [one === name ? fresh : one, text]));
   rules.packs[fresh] = rules.packs[name];
-  delete rules.packs[name];
   if (rules.off.delete(packOf(name))) rules.off.add(packOf(fresh));
   if (rules.shown === name) rules.shown = fresh;
   editor.rename(name, fresh);
-}
-
-function setText(name, text) {
-  rules.files[name] = text;
-  rules.packs[name] = declared(text);
-  editor.add(name, text);
-  if (rules.shown === name) show(name);
 }
 
 /** A pack that another name is typed for gets a file of that name, if there is none. */
@@ -174,16 +164,14 @@ function followNames() {
 }
 
 /** A name like `pack` that no file has. */
-function freeName(pack) {
-  let number = 1;
-  const named = () => (number > 1 ? `${pack}${number}` : pack);
-  while (`${named()}.yaml` in rules.files) number++;
-  return named();
+function freeName(pack, number = 1) {
+  const name = number > 1 ? `${pack}${number}` : pack;
+  return `${name}.yaml` in rules.files ? freeName(pack, number + 1) : name;
 }
 
 function duplicate(name) {
   const pack = freeName(packOf(name).replace(/\d+$/, ""));
-  addFile(`${pack}.yaml`, rules.files[name].replace(/^(pack|ruleset): *\w+/m, `$1: ${pack}`));
+  addFile(`${pack}.yaml`, withName(rules.files[name], pack));
 }
 
 const undoButton = () => make("button", { type: "button", class: "small", onclick: () => $("undo").click() }, "Undo");
@@ -197,25 +185,21 @@ function removeFile(name) {
 
 /** Replaces the texts of some files, or deletes them; `like` has their order, and the packs that are off. */
 function exchange(texts, like = rules.moment()) {
-  const files = {};
-  for (const name of new Set([...Object.keys(like.files), ...Object.keys(rules.files), ...Object.keys(texts)])) {
-    const text = name in texts ? texts[name] : rules.files[name];
-    if (text !== undefined) files[name] = text;
-  }
-  rules.files = files;
+  const all = { ...like.files, ...rules.files, ...texts };
+  const kept = Object.keys(all).filter((name) => (name in texts ? texts : rules.files)[name] !== undefined);
+  rules.files = Object.fromEntries(kept.map((name) => [name, all[name]]));
   rules.off = new Set(like.off);
   for (const [name, text] of Object.entries(texts)) {
     rules.packs[name] = text && declared(text);
     if (text === undefined) editor.remove(name);
     else editor.add(name, text);
   }
-  show([rules.shown, like.shown].find((name) => name in files) ?? Object.keys(files).at(-1));
+  show([like.shown, rules.shown].find((name) => kept.includes(name)) ?? kept.at(-1));
   edited();
 }
 
 function toggle(pack) {
-  if (rules.off.has(pack)) rules.off.delete(pack);
-  else rules.off.add(pack);
+  if (!rules.off.delete(pack)) rules.off.add(pack);
   edited();
   showTabs();
 }
@@ -226,13 +210,7 @@ about: An element of my own.
 ${"core.yaml" in rules.files ? "needs: core\n" : ""}elements:
   ${name}:
     color: "#E0559A"
-${"core.yaml" in rules.files ? FALLING : ""}`;
-
-const FALLING = `    density: 4
-    gravity: yes
-    tags: powder
-`;
-
+${"core.yaml" in rules.files ? "    density: 4\n    gravity: yes\n    tags: powder\n" : ""}`;
 /** Adds a file, and shows it; one of that name is replaced. */
 export function addFile(name, text) {
   const replaced = name in rules.files;
@@ -253,8 +231,8 @@ export function addRuleset(files) {
   show(Object.keys(files).find((name) => isRuleset(files[name])));
 }
 
-function addPack() {
-  const name = freeName("mine");
+function addPack(wanted = "mine") {
+  const name = freeName(wanted);
   addFile(`${name}.yaml`, NEW(name));
 }
 
@@ -308,7 +286,11 @@ async function checkNow(applies) {
   if (found.ok && alike(rules.good, { files, off })) rules.good = { files, off };
   rules.diagnostics = found.diagnostics;
   rules.checkTook = performance.now() - began;
-  for (const [name, text] of Object.entries(found.texts)) if (!(name in rules.files)) addShipped(name, text);
+  for (const [name, text] of Object.entries(found.texts)) {
+    if (name in rules.files) continue;
+    [rules.files[name], rules.packs[name]] = [text, declared(text)]; // it ships, and the rules use it
+    editor.add(name, text);
+  }
   if (found.words) editor.know(found.words);
   editor.mark(found.diagnostics);
   showTabs();
@@ -321,13 +303,6 @@ async function checkNow(applies) {
   if (!applied && sitting === app.sitting) again = true;
   rules.applyTook = performance.now() - began;
   return found;
-}
-
-/** A pack that ships and that the rules use gets a tab, too. */
-function addShipped(name, text) {
-  rules.files[name] = text;
-  rules.packs[name] = declared(text);
-  editor.add(name, text);
 }
 
 /** Compiles checked files, and continues the world under them. Resolves to whether they run. */
@@ -395,6 +370,11 @@ function showProblems(ok) {
     return make("div", { ...attributes, title: "Enter or a click goes to the place" }, make("pre", {}, text));
   });
   if (listed.length > shown.length) shown.push(make("p", { class: "soft" }, `and ${listed.length - shown.length} more`));
+  const missing = listed.map((one) => /^no pack or ruleset `(\w+)`/.exec(one.message)?.[1]).filter((one) => one && !(`${one}.yaml` in rules.files));
+  if (missing.length) {
+    const adds = [...new Set(missing)].map((one) => make("button", { type: "button", class: "small", onclick: () => addPack(one) }, `Add ${one}`));
+    shown.unshift(make("p", {}, `Packs are missing: ${[...new Set(missing)].join(", ")}. Drop their files on the page, or `, ...adds, " as new ones."));
+  }
   if (!ok && rules.edited) shown.push(make("p", { class: "soft" }, "The last good rules keep running."));
   if (!shown.length) shown.push(make("p", { class: "good" }, "No mistakes."));
   $("problems").replaceChildren(...shown);

@@ -35,22 +35,20 @@ function save(open = true) {
   const { files = null, off = sheet.off, good, shown } = edits ?? {};
   const bytes = rest.compiled ? bytesOf.get(module) : undefined;
   const body = { ...rest, key: sheet.key, sheet: { ...sheet, worlds: [] }, files, off, good, shown, bytes };
-  const { blind, tint } = { blind: $("blind").checked, tint: $("tint").checked };
   const { brush, element, running, speed, tool, work: id } = app;
-  const settings = { blind, tint, brush: { ...brush }, element, running, speed, tool };
+  const settings = { blind: $("blind").checked, tint: $("tint").checked, brush: { ...brush }, element, running, speed, tool };
   const changed = Object.keys(files ?? {}).filter((name) => files[name] !== sheet.files[name]);
   const title = [sheet.key, ...changed.slice(0, 2)].join(", ");
-  const { rows, columns, fields } = rest.world;
+  const { rows, columns, fields, clock } = rest.world;
   const size = 2 * [...fields.values()].reduce((sum, { values }) => sum + values.byteLength, rows * columns) + (bytes?.length ?? 0);
-  const first = app.catalog.rules[0].key;
-  const about = `${rows}×${columns}, step ${rest.world.clock[2]}`;
+  const [first, about] = [app.catalog.rules[0].key, `${rows}×${columns}, step ${clock[2]}`];
   const head = { id, when: Date.now(), title, about, size, open, first, isWork: isWork(), hash: location.hash, settings, picture: picture() };
   const change = write((heads, works) => [works.put(body, id), heads.put(head)]);
   change.onabort = () => give(change.error);
   change.commit(); // at once: a page that is left hears no answers
   if (open) prune(id);
-  Object.assign(app, { unsaved: false });
-  saved = { step: rest.world.clock[2], at: performance.now() };
+  app.unsaved = false;
+  saved = { step: clock[2], at: performance.now() };
   sessionStorage.setItem("work", id);
   if (history.state?.work !== id) history.replaceState({ work: id }, "");
 }

@@ -73,17 +73,9 @@ app.surface = new Surface($("canvas"), {
     apply(app.held, cell, erasing);
     app.held = cell;
   },
-  end() {
-    [app.held, erasing] = [null, false];
-  },
-  hover(cell) {
-    outline(cell);
-    showCell(cell);
-  },
-  leave() {
-    leaveCell();
-    outline(null);
-  },
+  end: () => ([app.held, erasing] = [null, false]),
+  hover: (cell) => [outline(cell), showCell(cell)],
+  leave: () => [leaveCell(), outline(null)],
 });
 
 function outline(cell) {
@@ -135,8 +127,7 @@ export function choose(element) {
   if (!element) return;
   app.element = element.qualified;
   if (!["brush", "fill"].includes(app.tool)) setTool("brush");
-  for (const one of $("elements").children)
-    one.setAttribute("aria-checked", String(one.dataset.element === app.element));
+  for (const one of $("elements").children) one.setAttribute("aria-checked", String(one.dataset.element === app.element));
   markStop($("elements"));
 }
 
@@ -146,13 +137,7 @@ export function showElements() {
     swatch.style.background = app.colors.get(one.id);
     const checked = one.qualified === app.element;
     const title = i < 9 ? `${one.qualified} (${i + 1})` : one.qualified;
-    const attributes = {
-      type: "button",
-      role: "radio",
-      "aria-checked": String(checked),
-      "data-element": one.qualified,
-      title,
-    };
+    const attributes = { type: "button", role: "radio", "aria-checked": String(checked), "data-element": one.qualified, title };
     return make("button", { ...attributes, onclick: () => choose(one) }, swatch, make("span", {}, one.name));
   });
   $("elements").replaceChildren(...buttons);
@@ -178,8 +163,7 @@ export function setTool(tool) {
   const button = document.querySelector(`[data-tool=${tool}]`);
   if (!button || button.disabled) return;
   app.tool = tool;
-  for (const one of document.querySelectorAll("[data-tool]"))
-    one.setAttribute("aria-checked", String(one === button));
+  for (const one of document.querySelectorAll("[data-tool]")) one.setAttribute("aria-checked", String(one === button));
   markStop($("tool"));
   $("field-row").hidden = tool !== "field";
   $("canvas").style.cursor = tool === "look" ? "help" : "crosshair";

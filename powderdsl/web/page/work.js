@@ -135,7 +135,7 @@ async function travel(way) {
   const exchange = (act) => {
     const present = moment();
     if (entry.texts) present.texts = textsOf(Object.keys(entry.texts), present.edits);
-    app.history[way](present);
+    app.history.go(way, present);
     act();
     refresh();
   };

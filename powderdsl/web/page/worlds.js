@@ -8,13 +8,11 @@ export const MAX_CLOCK = 2n ** 63n - 1n; // of seeds and steps
 export class BadWorld extends Error {}
 
 export function bytes(text) {
-  let decoded;
   try {
-    decoded = atob(text);
+    return Uint8Array.from(atob(text), (c) => c.charCodeAt(0));
   } catch {
-    throw new BadWorld("a part of the world is not base64");
+    throw new BadWorld("it is damaged: a part is not base64");
   }
-  return Uint8Array.from(decoded, (c) => c.charCodeAt(0));
 }
 
 export function text(array) {
@@ -62,12 +60,5 @@ export function writeWorld({ rows, columns, palette, ids, fields, clock }) {
   for (const [name, { components, values }] of fields) {
     written[name] = { type: types.get(values.constructor), components, values: text(values) };
   }
-  return {
-    rows,
-    columns,
-    palette: Object.fromEntries(palette),
-    ids: text(ids),
-    fields: written,
-    clock: clock.map(String),
-  };
+  return { rows, columns, palette: Object.fromEntries(palette), ids: text(ids), fields: written, clock: clock.map(String) };
 }
