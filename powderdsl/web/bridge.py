@@ -204,10 +204,10 @@ class Session:
             for result in run_examples(own, sim=self._simulator())
         ]
 
-    def trace(self, world: dict[str, Any], row: int, column: int, params: dict[str, float]) -> str:
-        """The trace of a cell in the next step of a world, with other values for some parameters."""
+    def trace(self, world: dict[str, Any], row: int, column: int, params: dict[str, float]) -> dict[str, Any]:
+        """The trace of a cell in the next step of a world, as text and as data; `params` have other values."""
         from powderdsl.simulation.simulator import Simulator
-        from powderdsl.simulation.tracing import trace, trace_text
+        from powderdsl.simulation.tracing import trace, trace_data, trace_text
 
         reporter, sim = Reporter(), self._simulator()
         rules = self._rules()
@@ -216,8 +216,8 @@ class Session:
             rules = set_params(rules, changed, reporter)
             reporter.raise_if_errors()
             sim = Simulator(rules, "wasm", tensors=False, memo=self.memo)
-        text = trace_text(trace(self._world(world, sim), int(row), int(column), 1))
-        return text.replace(f"{self.folder}/", "")
+        found = trace(self._world(world, sim), int(row), int(column), 1)
+        return {"text": trace_text(found), "data": trace_data(found)}
 
     def save(self, world: dict[str, Any]) -> bytes:
         """A world as an .npz, which `powderdsl run` continues."""

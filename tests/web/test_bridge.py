@@ -164,8 +164,12 @@ def test_traces_are_those_of_the_world(session: bridge.Session) -> None:
     sand = ruleset.element("sand")
     ids[2, 3] = sand.id
     data = world_data(ruleset, ids, {}, (0, 0, 0))
-    assert "cell 3,3 in step 1 of powderworld" in call("trace", data, 3, 3, {})["result"]
-    assert "sand" in call("trace", data, 3, 3, {"water.melt": 0.5})["result"]
+    found = call("trace", data, 3, 3, {})["result"]
+    assert "cell 3,3 in step 1 of powderworld" in found["text"]
+    element = found["data"]["slots"]["element"]
+    assert (element["before"], element["after"]) == ("empty", "sand")
+    assert element["writer"]["file"] == "core.yaml"
+    assert "sand" in call("trace", data, 3, 3, {"water.melt": 0.5})["result"]["text"]
     assert "error" in call("trace", data, 99, 3, {})
 
 

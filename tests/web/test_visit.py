@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 from collections.abc import Iterator
 from functools import partial
@@ -89,6 +90,26 @@ def test_one_key_records(seen: dict[str, Any], folder: Path) -> None:
     assert seen["closed"]
     assert seen["recording"] == [True, "Recording. Press M to end and save it."]
     assert (folder / "film.webm").read_bytes()[:4] == b"\x1aE\xdf\xa3"
+
+
+def test_the_chart_outlives_edits_and_has_a_legend(seen: dict[str, Any]) -> None:
+    assert seen["chart"]["earlier"]
+    assert "sand" in seen["chart"]["legend"]
+
+
+def test_a_change_is_explained_in_a_sentence_that_leads_to_the_rule(seen: dict[str, Any]) -> None:
+    why = r"The cell \(25, 20\) changed from empty to sand that came from \(2[234], \d+\) in step 3, by (.+) core.yaml:\d+"
+    found = re.fullmatch(why, seen["why"])
+    assert found, seen["why"]
+    assert seen["near"] == 2
+    assert seen["rule"][0] == "core.yaml"
+    assert found[1].split()[0] in seen["rule"][1]
+
+
+def test_parameters_and_fields_are_described(seen: dict[str, Any]) -> None:
+    assert "interact < dies" in seen["parameters"]
+    assert {"empty", "lava", "cloner"} <= set(seen["choices"])
+    assert "clone lava" in seen["set"]
 
 
 def test_nothing_fails(seen: dict[str, Any]) -> None:

@@ -82,6 +82,60 @@ const film = page.waitForEvent("download");
 await page.keyboard.press("m");
 await (await film).saveAs(join(folder, "film.webm"));
 
+// The chart goes on under other rules; its legend has the numbers of the point under the pointer.
+const said = (id, pattern) =>
+  page.waitForFunction(([one, source]) => new RegExp(source).test(document.getElementById(one).textContent), [id, pattern.source], { timeout: 60_000 });
+await page.waitForFunction(() => powderdsl.compilerReady, null, { timeout: 60_000 });
+await said("problems", /No mistakes/);
+const ruled = await page.evaluate(() => {
+  const { view } = powderdsl.edits.editor;
+  const at = view.state.doc.toString().indexOf("density: 4");
+  view.dispatch({ changes: { from: at, to: at + 10, insert: "density: 2" } });
+  return Number(powderdsl.engine.clock()[2]);
+});
+await said("status", /The new rules run/);
+await page.waitForFunction((step) => powderdsl.engine.clock()[2] > step + 30, ruled);
+const chart = await page.locator("#chart").boundingBox();
+await page.mouse.move(chart.x + 2, chart.y + 40);
+const legend = await page.locator("#legend").innerText();
+seen.chart = { earlier: Number(legend.match(/step (\d+)/)[1]) < ruled, legend };
+await page.locator("#reset").click();
+await page.waitForFunction(() => /step \d$|step [1-9]\d$/.test(document.querySelector("#legend span").textContent));
+await page.locator("#undo").click();
+
+// Explain says in a sentence which rule it was, shows the cells around, and leads to the rule.
+if (await page.evaluate(() => powderdsl.running)) await page.locator("#run").click();
+await page.locator("#world").selectOption("empty");
+await page.locator("#elements button", { hasText: "sand" }).click();
+const world = await page.locator("#canvas").boundingBox();
+const place = (row, column) => [world.x + (world.width * (column + 0.5)) / 64, world.y + (world.height * (row + 0.5)) / 64];
+await page.mouse.click(...place(20, 20));
+for (let i = 0; i < 3; i++) await page.locator("#step").click();
+await page.keyboard.press("t");
+await page.mouse.click(...place(25, 20));
+await said("checks", /The cell \(/);
+seen.why = await page.locator("#checks p").first().innerText();
+seen.near = await page.locator("#checks .near canvas").count();
+await page.locator("#checks p button").first().click();
+seen.rule = await page.evaluate(() => {
+  const { view } = powderdsl.edits.editor;
+  return [powderdsl.edits.shown, view.state.doc.lineAt(view.state.selection.main.head).text.trim()];
+});
+
+// Parameters name the line that uses them; fields that hold elements are set by name.
+await page.locator("#tab-parameters").click();
+seen.parameters = await page.locator(".parameter", { hasText: "fire.dies" }).innerText();
+await page.keyboard.press("v");
+await page.locator("#field").selectOption({ label: "clone" });
+seen.choices = await page.locator("#choice option").allInnerTexts();
+await page.locator("#elements button", { hasText: "cloner" }).click();
+await page.mouse.click(...place(40, 40));
+await page.keyboard.press("v");
+await page.locator("#choice").selectOption({ label: "lava" });
+await page.mouse.click(...place(40, 40));
+await page.mouse.move(...place(40, 40.2));
+seen.set = await page.locator("#hover").getAttribute("title");
+
 seen.problems = problems.flat().filter((one) => !/GPU stall/.test(one));
 console.log(JSON.stringify(seen, null, 1));
 await browser.close();

@@ -2,7 +2,8 @@
 
 import { $, failed, make, report } from "./dom.js";
 import { Engine } from "./engine.js";
-import { rules } from "./rules.js";
+import { neighborhood } from "./readings.js";
+import { goTo, rules } from "./rules.js";
 import { setRunning } from "./stage.js";
 import { app } from "./state.js";
 import { showPanel } from "./tabs.js";
@@ -84,20 +85,35 @@ app.explain = async ([row, column]) => {
   showPanel("checks");
   why.replaceChildren(make("p", { class: "soft" }, "Looking for the step that changed the cell…"));
   try {
-    const { before, step, changed } = await lastChange(row, column);
+    const { before, after, step, changed } = await lastChange(row, column);
     if (!before) {
       why.replaceChildren(make("p", { class: "soft" }, "Nothing has happened since it was painted: run a step first."));
       return;
     }
     const { parameters, values } = app.engine;
     const set = Object.fromEntries(parameters.map((one, i) => [one.name, values[i]]));
-    const text = await rules.compiler.call("trace", writeWorld(before), row, column, set);
-    const head = changed ? `It last changed in step ${step}.` : `It has not changed lately; this is step ${step}.`;
-    why.replaceChildren(make("p", {}, head), report(text));
+    const { text, data } = await rules.compiler.call("trace", writeWorld(before), row, column, set);
+    const pictures = make("div", { class: "row" }, neighborhood(before.ids, row, column, "before"), neighborhood(after, row, column, "after"));
+    const more = make("details", { class: "result" }, make("summary", {}, "All rules that wrote it, or nearly did"), report(text));
+    why.replaceChildren(make("p", {}, ...sentence(data, row, column, step, changed)), pictures, more);
   } catch (error) {
     why.replaceChildren(make("p", { class: "bad" }, String(error.message ?? error)));
   }
 };
+
+/** What a trace says about the element, with a link to the rule. */
+function sentence({ slots, writes }, row, column, step, changed) {
+  const { before, after, writer } = slots.element;
+  const cell = `The cell (${row}, ${column})`;
+  if (!changed) return [`${cell} has not changed lately. In step ${step} it was ${before}.`];
+  const last = writes.findLast((one) => one.slot === "element" && one.after === after && one.after !== one.before);
+  const from = last?.source ? ` that came from (${last.source.join(", ")})` : "";
+  const head = `${cell} changed from ${before} to ${after}${from} in step ${step}`;
+  if (!writer) return [`${head}, by no rule.`];
+  const go = () => goTo(writer.file, writer.line, writer.column);
+  const link = make("button", { type: "button", class: "small", onclick: go, title: "Show the rule" }, `${writer.file}:${writer.line}`);
+  return [`${head}, by `, make("code", {}, writer.text), " ", link];
+}
 
 async function lastChange(row, column) {
   const now = app.engine.clock()[2];
@@ -121,9 +137,11 @@ async function lastChange(row, column) {
     if (found !== null) {
       scratch.restore(checkpoint);
       scratch.step(Number(found - checkpoint.clock[2]));
-      return { before: scratch.snapshot(), step: found + 1n, changed: true };
+      const before = scratch.snapshot();
+      scratch.step(1);
+      return { before, after: scratch.ids(), step: found + 1n, changed: true };
     }
     until = checkpoint.clock[2];
   }
-  return { before: fallback, step: now, changed: false };
+  return { before: fallback, after: app.engine.ids(), step: now, changed: false };
 }

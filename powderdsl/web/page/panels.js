@@ -11,6 +11,20 @@ import { readWorld } from "./worlds.js";
 
 const LIVE_EVERY = 100; // ms between two steps of a picture
 
+/** What a parameter is about, and the first line of its pack that uses it. */
+function described({ name, about }) {
+  const [pack, own] = name.split(".");
+  const file = `${pack}.yaml`;
+  const lines = ((app.edits?.files ?? app.rules.files)[file] ?? "").split("\n");
+  const uses = (line) => new RegExp(`\\b${own}\\b`).test(line) && !new RegExp(`^ *(about:|params:|#)|(^|[{,]) *${own}:`).test(line);
+  const at = lines.findIndex(uses);
+  const found = about ? [make("small", {}, about)] : [];
+  if (at < 0) return found;
+  const go = () => import("./rules.js").then(({ goTo }) => goTo(file, at + 1, lines[at].search(new RegExp(`\\b${own}\\b`)) + 1));
+  const link = make("button", { type: "button", class: "small", onclick: go, title: "Show the line" }, `${file}:${at + 1}`);
+  return [...found, make("small", {}, make("code", {}, lines[at].trim().replace(/^- /, "")), " ", link)];
+}
+
 function showParameters(engine) {
   const rows = engine.parameters.map((one, number) => {
     const whole = one.kind === "int" || one.kind === "flag";
@@ -33,7 +47,7 @@ function showParameters(engine) {
       set(one.value);
       sliding = false;
     };
-    return make("div", { class: "parameter" }, make("span", {}, one.name), make("span", {}, output, " ", back), range, make("small", {}, one.about ?? ""));
+    return make("div", { class: "parameter" }, make("span", {}, one.name), make("span", {}, output, " ", back), range, ...described(one));
   });
   $("parameters").replaceChildren(...(rows.length ? rows : [make("p", { class: "soft" }, "These rules have no parameters.")]));
 }

@@ -6,6 +6,7 @@ import { Editor } from "./editor.js";
 import { Engine } from "./engine.js";
 import { refresh, use } from "./stage.js";
 import { app } from "./state.js";
+import { showPanel } from "./tabs.js";
 import { choose } from "./tools.js";
 import { bytesOf, remember, showMenus, swap } from "./work.js";
 
@@ -355,15 +356,19 @@ function showProblem(text) {
   $("problems").replaceChildren(make("div", { class: "problem" }, make("pre", {}, text)));
 }
 
+/** Shows a place of a file in the editor. */
+export function goTo(file, line, column) {
+  if (!(file in rules.files)) return;
+  showPanel("rules-panel");
+  show(file);
+  editor.goTo(line, column);
+}
+
 function showProblems(ok) {
   const listed = rules.diagnostics.filter((one) => one.severity !== "note");
   const shown = listed.slice(0, 40).map((one) => {
     const { span } = one.primary;
-    const go = () => {
-      if (!span || !(span.file in rules.files)) return;
-      show(span.file);
-      editor.goTo(span.start.line, span.start.column);
-    };
+    const go = () => span && goTo(span.file, span.start.line, span.start.column);
     const text = one.text.replace(/\n *= more: .*$/, "");
     const keys = ({ key }) => key === "Enter" && go();
     const attributes = { class: `problem ${one.severity}`, tabindex: "0", onclick: go, onkeydown: keys };

@@ -2,7 +2,7 @@
 
 import { blindColors } from "./colors.js";
 import { $ } from "./dom.js";
-import { clearChart, showReadings } from "./readings.js";
+import { showReadings } from "./readings.js";
 import { app } from "./state.js";
 import { Painter, Screen } from "./view.js";
 
@@ -32,7 +32,6 @@ export function use(engine) {
     app.element = engine.elements[Math.min(2, engine.elements.length - 1)].qualified;
   }
   layout();
-  clearChart();
   for (const one of app.onEngine) one(engine);
   if (first) requestAnimationFrame(frame);
 }

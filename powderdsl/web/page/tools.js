@@ -2,7 +2,7 @@
 
 import { $, fill, make, say } from "./dom.js";
 import { ARRAYS } from "./engine.js";
-import { clearChart, leaveCell, showCell } from "./readings.js";
+import { DIRECTIONS, leaveCell, showCell } from "./readings.js";
 import { redraw, refresh, setRunning, step } from "./stage.js";
 import { app } from "./state.js";
 import { markStop } from "./tabs.js";
@@ -46,7 +46,8 @@ function setChosenField() {
   const { engine } = app;
   const number = Number($("field").value);
   const { components } = engine.fields[number];
-  const value = held(ARRAYS[engine.fields[number].type], Number($("value").value) || 0);
+  const input = $("choice").hidden ? $("value") : $("choice");
+  const value = held(ARRAYS[engine.fields[number].type], Number(input.value) || 0);
   if (components === 1) engine.setField(number, mask, [value]);
   else {
     const view = engine.field(number);
@@ -111,7 +112,6 @@ export function reset() {
   remember();
   app.painted = app.named.world === "";
   app.engine.restore(app.start);
-  clearChart();
   refresh();
 }
 
@@ -156,7 +156,13 @@ function showFields() {
 }
 
 export function showComponents() {
-  $("component").hidden = app.engine.fields[Number($("field").value)]?.components !== 2;
+  const { elements, fields } = app.engine;
+  const { components, kind } = fields[Number($("field").value)] ?? {};
+  $("component").hidden = components !== 2;
+  const named = { element: elements.map((one) => [one.id, one.name]), direction: [...DIRECTIONS.entries()], flag: [[1, "yes"], [0, "no"]] };
+  $("choice").hidden = !(kind in named);
+  $("value").hidden = kind in named;
+  fill($("choice"), named[kind] ?? [], String(named[kind]?.[0][0]));
 }
 
 export function setTool(tool) {

@@ -229,27 +229,44 @@ export function region(mask, rows, columns, row, column, ids) {
   }
 }
 
-/** Lines of counts over time, one for each element that the world has. */
-export function chart(canvas, history, colors) {
-  const largest = Math.max(1, ...history.map((counts) => Math.max(...colors.map(([id]) => counts[id]))));
+const EDGE = 15; // pixels above and below the lines of a chart, for words
+const LEAST = 100; // points that a chart has room for
+
+/** Lines of counts over time with a scale, and a mark at one of the points. @param {{color: string, values: number[]}[]} lines */
+export function chart(canvas, steps, lines, at) {
+  const ratio = window.devicePixelRatio || 1;
+  const [width, height] = [canvas.clientWidth, canvas.clientHeight];
+  [canvas.width, canvas.height] = [width * ratio, height * ratio];
   const context = canvas.getContext("2d");
-  const { width, height } = canvas;
-  context.clearRect(0, 0, width, height);
-  for (const [id, color] of colors) {
-    if (!history.some((counts) => counts[id])) continue;
-    context.strokeStyle = color;
-    context.lineWidth = 1.5;
+  context.scale(ratio, ratio);
+  const largest = Math.max(1, ...lines.flatMap((one) => one.values));
+  const x = (i) => (i * (width - 2)) / Math.max(steps.length - 1, LEAST) + 1;
+  // The square root shows small counts beside large ones.
+  const y = (count) => height - EDGE - Math.sqrt(count / largest) * (height - 2 * EDGE);
+  const { color, fontFamily } = getComputedStyle(canvas);
+  [context.font, context.fillStyle, context.strokeStyle] = [`11px ${fontFamily}`, color, color];
+  for (const count of new Set([0, Math.round(largest / 4), largest])) {
+    context.globalAlpha = 0.3;
+    context.fillRect(0, Math.round(y(count)), width, 1);
+    context.globalAlpha = 1;
+    if (count) context.fillText(count.toLocaleString("en"), 4, y(count) - 3);
+  }
+  context.fillText(`step ${steps[0]}`, 4, height - 3);
+  context.textAlign = "right";
+  if (steps.length > 1) context.fillText(steps.at(-1), Math.max(x(steps.length - 1), 120), height - 3);
+  if (at >= 0) context.fillRect(x(at), 0, 1, height);
+  context.lineWidth = 1.5;
+  for (const { color: own, values } of lines) {
+    context.strokeStyle = own;
     context.beginPath();
-    history.forEach((counts, i) => {
-      const x = (i * width) / Math.max(history.length - 1, 100);
-      // The square root shows small counts beside large ones.
-      const y = height - 2 - Math.sqrt(counts[id] / largest) * (height - 4);
-      if (i) context.lineTo(x, y);
-      else context.moveTo(x, y);
-    });
+    values.forEach((count, i) => context.lineTo(x(i), y(count)));
     context.stroke();
   }
 }
+
+/** The point of a chart at so many pixels from its left. */
+export const chartPoint = (canvas, left, count) =>
+  Math.max(0, Math.min(count - 1, Math.round(((left - 1) * Math.max(count - 1, LEAST)) / (canvas.clientWidth - 2))));
 
 /** What people do on the canvas, with a pointer, a finger or the keyboard, in cells. */
 export class Surface {

@@ -109,6 +109,7 @@ export function open(found, engine) {
   Object.assign(app, { rules: sheet, compiled, opened: found.edits, sitting, work, keepParameters: false });
   setParameters(engine, found.parameters);
   use(engine);
+  clearChart();
   const lost = show(found);
   for (const one of app.onRules) one(sheet, found.edits);
   return lost;
@@ -122,7 +123,6 @@ function show({ world, start, named, painted, parameters }) {
     setParameters(app.engine, parameters);
     for (const one of app.onEngine) one(app.engine);
   }
-  clearChart();
   showMenus();
   refresh();
   return lost;
