@@ -38,10 +38,6 @@ EXAMPLES = {
 """Compositions of the examples, and which of their packs are mutated."""
 
 
-UNCOUNTED = frozenset({"mole"})
-"""Packs whose mutants have not been counted yet: it takes hours."""
-
-
 @cache
 def compositions() -> dict[str, tuple[str, ...]]:
     """What is judged: rules, and which of their packs, each in the first rules that load it."""
@@ -50,7 +46,7 @@ def compositions() -> dict[str, tuple[str, ...]]:
         if rules not in shipped_variants():
             known = {pack for packs in chosen.values() for pack in packs}
             names = [pack.name.text for pack in read([rules], Reporter())[0]]
-            chosen[rules] = tuple(name for name in names if name not in known | UNCOUNTED)
+            chosen[rules] = tuple(name for name in names if name not in known)
     return {**chosen, **EXAMPLES}
 
 
