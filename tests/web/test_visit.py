@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import re
 import shutil
-from collections.abc import Iterator
 from functools import partial
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
@@ -46,17 +45,28 @@ class Quiet(SimpleHTTPRequestHandler):
         pass
 
 
-@pytest.fixture(scope="module")
-def seen(folder: Path) -> Iterator[dict[str, Any]]:
-    """What views.mjs saw."""
+def saw(script: str, folder: Path) -> dict[str, Any]:
+    """What a script saw of the site."""
     server = ThreadingHTTPServer(("127.0.0.1", 0), partial(Quiet, directory=str(folder)))
     Thread(target=server.serve_forever, daemon=True).start()
     address = f"http://127.0.0.1:{server.server_port}/"
     try:
-        yield json.loads(succeed(str(shutil.which("node")), HERE / "views.mjs", address, folder, cwd=folder))
+        return json.loads(succeed(str(shutil.which("node")), HERE / script, address, folder, cwd=folder))
     finally:
         server.shutdown()
         server.server_close()
+
+
+@pytest.fixture(scope="module")
+def seen(folder: Path) -> dict[str, Any]:
+    return saw("views.mjs", folder)
+
+
+@pytest.fixture(scope="module")
+def felt(folder: Path) -> dict[str, Any]:
+    if not (HERE / "node_modules" / "axe-core").is_dir():
+        pytest.skip("axe-core is missing: `make web` fetches it")
+    return saw("access.mjs", folder)
 
 
 def test_a_second_visit_needs_no_network(folder: Path) -> None:
@@ -107,10 +117,31 @@ def test_a_change_is_explained_in_a_sentence_that_leads_to_the_rule(seen: dict[s
 
 
 def test_parameters_and_fields_are_described(seen: dict[str, Any]) -> None:
-    assert "interact < dies" in seen["parameters"]
+    assert "element < dies" in seen["parameters"]
     assert {"empty", "lava", "cloner"} <= set(seen["choices"])
     assert "clone lava" in seen["set"]
 
 
 def test_nothing_fails(seen: dict[str, Any]) -> None:
     assert seen["problems"] == []
+
+
+def test_axe_finds_nothing(felt: dict[str, Any]) -> None:
+    assert felt["violations"] == []
+    assert felt["problems"] == []
+
+
+def test_phones_have_the_world_the_palette_and_large_buttons(felt: dict[str, Any]) -> None:
+    assert {where: names for where, names in felt["small"].items() if names} == {}
+    assert len(felt["small"]) == 12
+    assert {where: names for where, names in felt["reach"].items() if names} == {}
+    assert felt["wide"] == []
+
+
+def test_two_fingers_zoom_and_do_not_paint(felt: dict[str, Any]) -> None:
+    assert felt["fingers"] == {"painted": True, "undone": True, "factor": 2, "middle": 0, "paints": True}
+
+
+def test_worlds_can_be_dark_and_still(felt: dict[str, Any]) -> None:
+    assert felt["dark"]["ground"] < 100 <= felt["dark"]["least"]
+    assert felt["still"] == [False, 0]

@@ -2,10 +2,10 @@
 
 import { $, failed, get } from "./dom.js";
 import { addWorlds, chooseRules, openRules, resize, startWorld } from "./opening.js";
-import { layout, newPainter, picture, refresh, setRunning } from "./stage.js";
+import { isStill, layout, newPainter, picture, refresh, setRunning } from "./stage.js";
 import { app } from "./state.js";
 import { restore } from "./store.js";
-import { arrows, showPanel } from "./tabs.js";
+import { arrows, showPanel, toggleSheet } from "./tabs.js";
 import { SPEEDS, choose, reset, setBrush, setSpeed, setTool, showComponents, showElements, stepOnce } from "./tools.js";
 import { redo, undo } from "./work.js";
 
@@ -59,13 +59,15 @@ function attach() {
   $("size").onchange = resize;
   $("rules").onchange = () => chooseRules($("rules").value);
   $("tint").onchange = refresh;
-  $("blind").onchange = () => {
-    newPainter();
-    showElements();
-    refresh();
-  };
+  for (const id of ["blind", "dark"]) {
+    $(id).onchange = () => {
+      newPainter();
+      showElements();
+      refresh();
+    };
+  }
   for (const one of document.querySelectorAll("[data-tool]")) one.onclick = () => setTool(one.dataset.tool);
-  for (const one of document.querySelectorAll("[data-panel]")) one.onclick = () => showPanel(one.dataset.panel);
+  for (const one of document.querySelectorAll("[data-panel]")) one.onclick = () => toggleSheet(one.dataset.panel);
   for (const id of ["tool", "elements", "tabs"]) arrows($(id));
   document.addEventListener("keydown", key);
   new ResizeObserver(() => app.engine && layout()).observe($("frame"));
@@ -95,11 +97,12 @@ async function begin() {
   setBrush(5);
   setSpeed(SPEEDS.indexOf(app.speed));
   showPanel("rules-panel");
+  $("side").classList.add("closed");
   app.catalog = await (await get("catalog.json")).json();
   const first = app.catalog.rules.find((one) => one.key === asked.get("rules")) ?? app.catalog.rules[0];
   const isNew = embedded || asked.has("rules");
   app.isBack = !isNew && (await restore().catch((error) => console.info(`powderdsl: ${error}`)));
-  if (!app.isBack) await openRules(first.key, { size: first.sizes[0].join("x") });
+  if (!app.isBack) await openRules(first.key, { size: first.sizes[0].join("x"), run: !isStill() });
   app.firstWorld = performance.now();
   // The rest comes after the first picture: the editor, and Python in a worker.
   await picture();

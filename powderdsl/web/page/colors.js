@@ -57,3 +57,22 @@ export function blindColors(elements) {
   }
   return found;
 }
+
+const NIGHT = "#14161B";
+const SEEN = 0.25; // the least difference from the ground
+
+/**
+ * Colors for a dark ground: those that would vanish on it become lighter.
+ * @returns {Map<number, string>} by id, of those that change
+ */
+export function darkColors(elements, ground) {
+  const night = looks(NIGHT);
+  const found = new Map([[ground, NIGHT]]);
+  for (const { id, color } of elements) {
+    let lighter = color;
+    for (let i = 0; i < 20 && far(looks(lighter).whole, night.whole) < SEEN; i++)
+      lighter = `#${channels(lighter).map((c) => Math.min(255, c + 8).toString(16).padStart(2, "0")).join("")}`;
+    if (id !== ground && lighter !== color) found.set(id, lighter);
+  }
+  return found;
+}

@@ -118,7 +118,7 @@ export class Editor {
         syntaxHighlighting(STYLE),
         coloring,
         THEME,
-        EditorView.contentAttributes.of({ "aria-label": "Rules. Escape, then Tab leaves the editor." }),
+        EditorView.contentAttributes.of({ tabindex: "0", "aria-label": "Rules. Escape, then Tab leaves the editor." }),
         // Escape, then Tab leaves the editor: CodeMirror's own way out for keyboards.
         keymap.of([...completionKeymap, ...searchKeymap, ...historyKeymap, ...defaultKeymap, indentWithTab]),
         EditorView.updateListener.of((update) => {

@@ -4,6 +4,7 @@ import { $, make } from "./dom.js";
 import { Engine } from "./engine.js";
 import { chooseRules } from "./opening.js";
 import { sheetOf, shippedModule } from "./shipped.js";
+import { isStill } from "./stage.js";
 import { app } from "./state.js";
 import { Painter } from "./view.js";
 import { remember } from "./work.js";
@@ -92,7 +93,7 @@ const pictured = (sheet) => readWorld(sheet.worlds.find((one) => one.name === sh
 function live() {
   for (const { engine, painter, canvas, sheet } of cards ?? []) {
     if (!engine) continue;
-    engine.step(1);
+    if (!isStill()) engine.step(1);
     if (engine.clock()[2] > 600n) engine.restore(pictured(sheet));
     canvas.getContext("2d").putImageData(painter.draw(), 0, 0);
   }

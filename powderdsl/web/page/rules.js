@@ -97,7 +97,7 @@ function showTabs() {
     const keys = ({ key }) => (key === "F2" ? askName(name) : key === "Delete" && removeFile(name));
     const pressed = String(name === rules.shown);
     const button = make("button", { type: "button", "aria-pressed": pressed, onclick: () => show(name), onkeydown: keys }, label);
-    return make("span", { class: classes.filter(Boolean).join(" ") }, ...(isRuleset(text) ? [] : [box]), button);
+    return make("span", { class: classes.filter(Boolean).join(" ") }, ...(isRuleset(text) ? [] : [make("label", {}, box)]), button);
   });
   const one = rules.shown;
   const act = (label, title, onclick) => make("button", { type: "button", class: "small", title, "aria-label": title, onclick }, label);

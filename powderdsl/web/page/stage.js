@@ -1,6 +1,6 @@
 // The world on its canvas: runs it, draws it, and puts other engines in its place.
 
-import { blindColors } from "./colors.js";
+import { blindColors, darkColors } from "./colors.js";
 import { $ } from "./dom.js";
 import { showReadings } from "./readings.js";
 import { app } from "./state.js";
@@ -38,7 +38,10 @@ export function use(engine) {
 
 /** Chooses the colors anew: the palette has changed. */
 export function newPainter() {
-  const colors = $("blind").checked ? blindColors(app.engine.elements) : new Map();
+  const { elements, ground } = app.engine;
+  const dark = $("dark").checked ? darkColors(elements, ground) : new Map();
+  const shown = elements.map((one) => ({ ...one, color: dark.get(one.id) ?? one.color }));
+  const colors = $("blind").checked ? blindColors(shown) : dark;
   app.painter = new Painter(app.engine, colors);
   app.colors = new Map(app.engine.elements.map((one) => [one.id, colors.get(one.id) ?? one.color]));
 }
@@ -84,6 +87,9 @@ export function step() {
   }
   engine.step(1);
 }
+
+/** Whether the user wants pages that do not move by themselves. */
+export const isStill = () => matchMedia("(prefers-reduced-motion: reduce)").matches;
 
 /** Resolves when the first picture is on the screen. */
 export const picture = () =>

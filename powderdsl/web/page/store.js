@@ -3,6 +3,7 @@
 import { $, failed, make, say } from "./dom.js";
 import { openWork } from "./opening.js";
 import { sheetOf } from "./shipped.js";
+import { isStill } from "./stage.js";
 import { app } from "./state.js";
 import { SPEEDS, setBrush, setSpeed, setTool } from "./tools.js";
 import { bytesOf, isWork, moment, newWork } from "./work.js";
@@ -36,7 +37,7 @@ function save(open = true) {
   const bytes = rest.compiled ? bytesOf.get(module) : undefined;
   const body = { ...rest, key: sheet.key, sheet: { ...sheet, worlds: [] }, files, off, good, shown, bytes };
   const { brush, element, running, speed, tool, work: id } = app;
-  const settings = { blind: $("blind").checked, tint: $("tint").checked, brush: { ...brush }, element, running, speed, tool };
+  const settings = { blind: $("blind").checked, dark: $("dark").checked, tint: $("tint").checked, brush: { ...brush }, element, running, speed, tool };
   const changed = Object.keys(files ?? {}).filter((name) => files[name] !== sheet.files[name]);
   const title = [sheet.key, ...changed.slice(0, 2)].join(", ");
   const { rows, columns, fields, clock } = rest.world;
@@ -103,13 +104,13 @@ export async function restore() {
     if (JSON.stringify((await sheetOf(key)).files) === JSON.stringify(sheet.files)) [head] = heads;
   }
   if (!head) return false;
-  const { blind, tint, brush, element, running, speed, tool } = head.settings;
-  [$("blind").checked, $("tint").checked, $("shape").value] = [blind, tint, brush.shape];
+  const { blind, dark, tint, brush, element, running, speed, tool } = head.settings;
+  [$("blind").checked, $("dark").checked, $("tint").checked, $("shape").value] = [blind, dark, tint, brush.shape];
   Object.assign(app, { element, brush });
   setBrush(brush.size);
   setSpeed(SPEEDS.indexOf(speed));
   setTool(tool);
-  return openKept(head, { words: head.isWork ? words : "", run: running });
+  return openKept(head, { words: head.isWork ? words : "", run: running && !isStill() });
 }
 
 const time = (head) => head && new Date(head.when).toLocaleString([], { dateStyle: "medium", timeStyle: "short" });

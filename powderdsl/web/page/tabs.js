@@ -3,8 +3,9 @@
 import { $ } from "./dom.js";
 import { app } from "./state.js";
 
-/** Shows the panel of a tab. */
+/** Shows the panel of a tab; on phones, as a sheet. */
 export function showPanel(id) {
+  $("side").classList.remove("closed");
   for (const tab of document.querySelectorAll("[data-panel]")) {
     const on = tab.dataset.panel === id;
     tab.setAttribute("aria-selected", String(on));
@@ -12,6 +13,13 @@ export function showPanel(id) {
   }
   markStop($("tabs"));
   for (const one of app.onPanel) one(id);
+}
+
+/** On phones, the tab of an open sheet closes it. */
+export function toggleSheet(id) {
+  const isOpen = !$(id).hidden && !$("side").classList.contains("closed");
+  showPanel(id);
+  $("side").classList.toggle("closed", isOpen);
 }
 
 const isOn = (button) => ["aria-checked", "aria-selected"].some((name) => button.getAttribute(name) === "true");

@@ -6,7 +6,7 @@ import { DIRECTIONS, leaveCell, showCell } from "./readings.js";
 import { redraw, refresh, setRunning, step } from "./stage.js";
 import { app } from "./state.js";
 import { markStop } from "./tabs.js";
-import { remember } from "./work.js";
+import { remember, undo } from "./work.js";
 import { Surface, region, stroke } from "./view.js";
 
 export const SPEEDS = [1, 2, 5, 10, 20, 30, 60, 120, 240, 480];
@@ -73,6 +73,11 @@ app.surface = new Surface($("canvas"), {
     if (app.held[0] === cell[0] && app.held[1] === cell[1]) return;
     apply(app.held, cell, erasing);
     app.held = cell;
+  },
+  /** A second finger has come: the first one was not to paint. */
+  cancel() {
+    if (app.held) undo();
+    app.held = null;
   },
   end: () => ([app.held, erasing] = [null, false]),
   hover: (cell) => [outline(cell), showCell(cell)],

@@ -119,7 +119,7 @@ export class Screen {
   /** @param {HTMLCanvasElement} canvas */
   constructor(canvas, fast = accelerated()) {
     this.canvas = canvas;
-    this.gl = fast && canvas.getContext("webgl2", { alpha: false, antialias: false, depth: false });
+    this.gl = fast && canvas.getContext("webgl2", { alpha: false, antialias: false, depth: false, preserveDrawingBuffer: true });
     if (this.gl) this._build();
     canvas.addEventListener("webglcontextlost", (event) => event.preventDefault());
     canvas.addEventListener("webglcontextrestored", () => {
@@ -272,15 +272,23 @@ export const chartPoint = (canvas, left, count) =>
 export class Surface {
   /**
    * @param {HTMLCanvasElement} canvas
-   * @param {{start: Function, move: Function, end: Function, hover: Function, leave: Function}} events
+   * @param {{start: Function, move: Function, end: Function, cancel: Function, hover: Function, leave: Function}} events
    */
   constructor(canvas, events) {
     this.canvas = canvas;
     this.events = events;
+    /** Fingers on the canvas, by id: two of them move and zoom it. @type {Map<number, number[]>} */ this.fingers = new Map();
+    this.zoom = { scale: 1, left: 0, top: 0 };
     /** @type {number[] | null} */ this.cursor = null;
     let active = null;
     canvas.addEventListener("pointerdown", (event) => {
       if (event.button > 0 && event.button !== 2) return;
+      if (event.pointerType === "touch") this.fingers.set(event.pointerId, [event.clientX, event.clientY]);
+      if (this.fingers.size > 1) {
+        if (active !== null) events.cancel();
+        active = null;
+        return;
+      }
       canvas.focus({ preventScroll: true });
       canvas.setPointerCapture(event.pointerId);
       active = event.pointerId;
@@ -288,6 +296,7 @@ export class Surface {
       event.preventDefault();
     });
     canvas.addEventListener("pointermove", (event) => {
+      if (this.fingers.size > 1) return this._pinch(event);
       const cell = this.cell(event);
       events.hover(cell);
       if (event.pointerId !== active) return;
@@ -296,14 +305,54 @@ export class Surface {
     });
     for (const name of ["pointerup", "pointercancel"]) {
       canvas.addEventListener(name, (event) => {
+        this.fingers.delete(event.pointerId);
         if (event.pointerId === active) events.end();
         if (event.pointerId === active) active = null;
       });
     }
+    canvas.addEventListener(
+      "wheel",
+      (event) => {
+        // Two fingers on a touchpad: apart with Ctrl, beside each other without.
+        if (!event.ctrlKey && this.zoom.scale === 1) return;
+        event.preventDefault();
+        const from = [event.clientX, event.clientY];
+        if (event.ctrlKey) this._move(from, from, Math.exp(-event.deltaY / 100));
+        else this._move(from, [from[0] - event.deltaX, from[1] - event.deltaY], 1);
+      },
+      { passive: false },
+    );
     canvas.addEventListener("pointerleave", () => events.leave());
     canvas.addEventListener("contextmenu", (event) => event.preventDefault());
     canvas.addEventListener("keydown", (event) => this._key(event));
     canvas.addEventListener("blur", () => (this.cursor = null));
+  }
+
+  /** One of two fingers moves: the world follows both. */
+  _pinch({ pointerId, clientX, clientY }) {
+    if (!this.fingers.has(pointerId)) return;
+    const measured = () => {
+      const [[a, b], [c, d]] = this.fingers.values();
+      return [[(a + c) / 2, (b + d) / 2], Math.hypot(a - c, b - d)];
+    };
+    const [from, before] = measured();
+    this.fingers.set(pointerId, [clientX, clientY]);
+    const [to, after] = measured();
+    this._move(from, to, after / Math.max(before, 1));
+  }
+
+  /** Zooms by a factor, and takes what was at one place of the window to another. */
+  _move(from, to, factor) {
+    const { canvas, zoom } = this;
+    const box = canvas.getBoundingClientRect();
+    const scale = Math.min(Math.max(zoom.scale * factor, 1), 16);
+    const follow = (side, origin, axis, size) => {
+      const moved = to[axis] - (origin - zoom[side]) - ((from[axis] - origin) * scale) / zoom.scale;
+      return Math.min(0, Math.max(moved, size * (1 - scale)));
+    };
+    const left = follow("left", box.left, 0, canvas.offsetWidth);
+    this.zoom = { scale, left, top: follow("top", box.top, 1, canvas.offsetHeight) };
+    for (const one of canvas.parentElement.children) one.style.transform = `translate(${left}px, ${this.zoom.top}px) scale(${scale})`;
   }
 
   /** Row and column of an event; they may lie outside while a stroke leaves the canvas. */
