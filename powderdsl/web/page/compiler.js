@@ -1,12 +1,15 @@
 // The front of the worker that compiles: requests with numbers, a time limit, and a fresh worker after a failure.
 
+import { $, say } from "./dom.js";
+import { app } from "./state.js";
+
 const LIMIT = 10_000; // ms
 /** For the first request to a fresh worker: rules that were good before, but slow machines load the compiler slowly. */
 const COLD_LIMIT = 60_000;
 
 export class CompileFailure extends Error {}
 
-export class Compiler {
+class Compiler {
   /** @param {(stage: string) => void} onStage  told about each stage of loading, then `ready` */
   constructor(onStage) {
     this.onStage = onStage;
@@ -107,3 +110,11 @@ export class Compiler {
 
 /** Reports that people ask for may take longer than a compilation. */
 const LIMITS = { invariants: 60_000, tests: 60_000, trace: 60_000 };
+
+/** The compiler of this page: Python begins to load when this module is first imported. */
+export const compiler = new Compiler((stage, error) => {
+  $("compiler").textContent = `Compiler: ${stage}`;
+  $("compiler").className = stage === "failed" ? "bad" : "";
+  if (stage === "ready" && !app.compilerReady) app.compilerReady = performance.now();
+  if (error) say(error, true);
+});

@@ -1,6 +1,6 @@
 // The rules that people edit: files as tabs, checks while they type, and changes that the running world takes over.
 
-import { Compiler } from "./compiler.js";
+import { compiler } from "./compiler.js";
 import { $, make, say } from "./dom.js";
 import { Editor } from "./editor.js";
 import { Engine } from "./engine.js";
@@ -36,7 +36,7 @@ export const rules = (app.edits = {
   moment: () => ({ files: { ...rules.files }, off: [...rules.off], good: rules.good, shown: rules.shown, edited: rules.edited }),
   exchange,
   recheck,
-  /** @type {Compiler} */ compiler: null,
+  compiler: null,
   /** Functions that are called when other rules run. */ onApplied: [],
 });
 
@@ -47,12 +47,7 @@ export const editor = new Editor($("editor"), (name, text) => {
 });
 
 rules.editor = editor;
-rules.compiler = new Compiler((stage, error) => {
-  $("compiler").textContent = `Compiler: ${stage}`;
-  $("compiler").className = stage === "failed" ? "bad" : "";
-  if (stage === "ready" && !app.compilerReady) app.compilerReady = performance.now();
-  if (error) say(error, true);
-});
+rules.compiler = compiler;
 
 /** Opens files, of which `good` run. Resolves to what the check finds. */
 export function openFiles({ files, off = [], shown, good }) {
