@@ -122,6 +122,12 @@ def test_parameters_and_fields_are_described(seen: dict[str, Any]) -> None:
     assert "clone lava" in seen["set"]
 
 
+def test_a_remix_names_what_it_came_from(seen: dict[str, Any]) -> None:
+    assert "It is a remix, of 2 works, one after the other." in seen["origin"][0]
+    assert seen["origin"][1] == 3
+    assert seen["framed"] == [False, 3]
+
+
 def test_nothing_fails(seen: dict[str, Any]) -> None:
     assert seen["problems"] == []
 

@@ -136,6 +136,29 @@ await page.mouse.click(...place(40, 40));
 await page.mouse.move(...place(40, 40.2));
 seen.set = await page.locator("#hover").getAttribute("title");
 
+// A remix names the work that it came from; an embedded link without edited rules needs no compiler.
+await page.locator("#rules").selectOption("life");
+await said("status", /Game of Life/);
+const links = [];
+for (let i = 0; i < 2; i++) {
+  await page.locator("#share").click();
+  await said("status", /link/);
+  links.push(new URL(page.url()).hash);
+  const next = await open(`play.html${links[i]}`);
+  await next.waitForFunction(() => powderdsl.linkOpened);
+  seen.origin = [await next.locator("#status").innerText(), await next.evaluate(() => powderdsl.named.from.length)];
+  if (i === 0) {
+    await next.locator("#share").click();
+    await next.waitForFunction((hash) => location.hash !== hash, links[0]);
+    await page.goto(`${address}play.html?again${await next.evaluate(() => location.hash)}`);
+    await page.waitForFunction(() => globalThis.powderdsl?.linkOpened);
+  }
+  await next.close();
+}
+const framed = await open(`play.html?embed${links[1]}`, { viewport: { width: 420, height: 420 } });
+await framed.waitForFunction(() => powderdsl.rules.key === "life" && powderdsl.running);
+seen.framed = await framed.evaluate(() => [Boolean(powderdsl.edits), powderdsl.named.from.length]);
+
 seen.problems = problems.flat().filter((one) => !/GPU stall/.test(one));
 console.log(JSON.stringify(seen, null, 1));
 await browser.close();

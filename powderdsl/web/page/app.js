@@ -1,7 +1,7 @@
 // Puts the parts of the page together: keys, buttons, and the order in which things load.
 
 import { $, failed, get } from "./dom.js";
-import { addWorlds, chooseRules, openRules, resize, startWorld } from "./opening.js";
+import { addWorlds, chooseRules, openRules, openWork, resize, startWorld } from "./opening.js";
 import { isStill, layout, newPainter, picture, refresh, setRunning } from "./stage.js";
 import { app } from "./state.js";
 import { restore } from "./store.js";
@@ -106,7 +106,14 @@ async function begin() {
   app.firstWorld = performance.now();
   // The rest comes after the first picture: the editor, and Python in a worker.
   await picture();
-  if (embedded && !location.hash) return;
+  if (embedded) {
+    // Only rules that somebody has edited need the compiler.
+    const { fromFragment } = await import("./share.js");
+    const shared = await fromFragment(location.hash);
+    if (shared?.files === null) await openWork(shared, { run: !isStill() });
+    if (!shared?.files) return;
+  }
+  await import("./compiler.js"); // its worker loads beside the editor
   await Promise.all([import("./panels.js"), import("./rules.js")]);
   await Promise.all([import("./exchange.js"), import("./checks.js")]);
   await addWorlds(await (await get("tasks.json")).json());

@@ -29,7 +29,8 @@ function changedFiles() {
 
 const present = () => {
   const world = app.engine.snapshot();
-  return { key: app.rules.key, files: changedFiles(), off: [...rules.off], parameters: changedParameters(), world };
+  const { from } = app.named;
+  return { key: app.rules.key, files: changedFiles(), off: [...rules.off], parameters: changedParameters(), from, world };
 };
 
 async function share() {
@@ -62,7 +63,10 @@ const saveAll = async (shared) => download(new Blob([await toBytes(shared)]), "w
 /** Opens what a link holds. */
 export async function openLink(fragment) {
   const shared = await fromFragment(fragment);
-  return shared !== null && openShared(shared, "This is the world of the link, paused.");
+  if (shared === null) return false;
+  const earlier = shared.from.length - 1;
+  const remix = earlier ? ` It is a remix, of ${earlier === 1 ? "one work" : `${earlier} works, one after the other`}.` : "";
+  return openShared(shared, `This is the world of the link, paused.${remix}`);
 }
 
 async function openShared(shared, words) {

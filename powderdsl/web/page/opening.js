@@ -66,7 +66,7 @@ export function startWorld() {
     return;
   }
   remember();
-  const named = { world: $("world").value, seed };
+  const named = { ...app.named, world: $("world").value, seed };
   begin(app.engine, app.rules, named);
   Object.assign(app, { start: app.engine.snapshot(), named, painted: !named.world });
   clearChart();
@@ -105,7 +105,7 @@ export function openWorld(world) {
       app.keepParameters = true;
       if (engine !== app.engine) use(engine);
       engine.restore(world);
-      const named = { world: "", seed: String(world.clock[0]) };
+      const named = { ...app.named, world: "", seed: String(world.clock[0]) };
       Object.assign(app, { start: engine.snapshot(), named, painted: true });
       refresh();
     };
@@ -163,7 +163,7 @@ export function openWork(found, { words, run = false, work } = {}) {
     return () => {
       const shown = found.shown ?? Object.keys(files ?? {}).find((name) => files[name] !== sheet.files[name]);
       const edits = edited ? { ...own, good: module ? good : sheet, shown, edited } : null;
-      const named = found.named ?? { world: "", seed: String(world.clock[0]) };
+      const named = found.named ?? { world: "", seed: String(world.clock[0]), from: found.from };
       const compiled = edited && module !== null;
       const start = found.start ?? world;
       const painted = found.painted ?? true;

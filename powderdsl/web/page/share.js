@@ -8,12 +8,14 @@ const PREFIX = "#w=";
 export const MAX_SHARED = 30_000;
 const MAX_LINK = 4 << 20; // characters of one that is opened
 const MAX_BYTES = 48 << 20; // after decompression
+const MAX_FROM = 16; // earlier links that one names
 const MAX_TEXT = 1 << 20; // characters of all files
 const FILE = /^[A-Za-z0-9_][A-Za-z0-9_-]{0,60}\.ya?ml$/;
 
 /**
  * @typedef {{key: string, files: Record<string, string | null> | null, off: string[],
- *   parameters: Record<string, number>, world: import("./engine.js").Snapshot}} Shared
+ *   parameters: Record<string, number>, from?: string[], world: import("./engine.js").Snapshot}} Shared
+ * `from` names the links that this work came from, the last one first.
  */
 
 async function squeezed(data, stream) {
@@ -102,7 +104,14 @@ export async function fromFragment(fragment) {
   const coded = fragment.slice(PREFIX.length);
   if (coded.length > MAX_LINK) throw new BadWorld("the link is too long");
   if (!/^[A-Za-z0-9_-]*$/.test(coded)) throw new BadWorld("the link is damaged: it has other characters than links have");
-  return fromBytes(() => bytes(coded.replaceAll("-", "+").replaceAll("_", "/")));
+  const found = await fromBytes(() => bytes(coded.replaceAll("-", "+").replaceAll("_", "/")));
+  return { ...found, from: [nameOf(coded), ...found.from].slice(0, MAX_FROM) };
+}
+
+/** A short name of a link: a hash (FNV-1a, forwards and backwards). */
+function nameOf(coded) {
+  const hash = (text) => [...text].reduce((found, one) => Math.imul(found ^ one.charCodeAt(0), 0x01000193), 0x811c9dc5) >>> 0;
+  return [coded, [...coded].reverse().join("")].map((one) => hash(one).toString(16).padStart(8, "0")).join("");
 }
 
 /** @param {() => Uint8Array} read @returns {Promise<Shared>} */
@@ -142,5 +151,7 @@ function checked(data) {
   expect(Array.isArray(off) && off.length <= 64 && off.every((one) => typeof one === "string"), "a bad list of packs");
   const parameters = data.parameters ?? {};
   expect(plain(parameters) && Object.values(parameters).every(Number.isFinite), "a bad parameter");
-  return { key: data.key, files, off, parameters, world: readWorld(data.world) };
+  const from = data.from ?? [];
+  expect(Array.isArray(from) && from.length <= MAX_FROM && from.every((one) => /^[0-9a-f]{16}$/.test(one)), "a bad origin");
+  return { key: data.key, files, off, parameters, from, world: readWorld(data.world) };
 }
