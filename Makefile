@@ -38,7 +38,7 @@ $(VENV)/.core: pyproject.toml constraints.txt
 
 $(VENV)/.ready: $(VENV)/.core
 	@echo "setting up $(VENV): tools for tests, checks, training, video and clusters"
-	@$(INSTALL) --no-build-isolation --editable '.[dev,minari,ray,rl,sb3-contrib,torchrl,video]'
+	@$(INSTALL) --no-build-isolation --editable '.[dev,lsp,minari,ray,rl,sb3-contrib,torchrl,video]'
 	@touch $@
 
 tests/web/node_modules: tests/web/package-lock.json

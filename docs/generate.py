@@ -20,9 +20,9 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # runs from a checkout that is not installed
 
-from powderdsl.cli.commands.schema import schema
 from powderdsl.cli.dispatch import GROUPS
 from powderdsl.compiler import MAX_BASES, shipped_rules
+from powderdsl.editing.json_schema import schema
 from powderdsl.experiments.studies import study as _study_file  # noqa: F401  # declares the records of studies
 from powderdsl.ir.stages import PIPELINE
 from powderdsl.model.builtins import (

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 from powderdsl.diagnostics import CompileError, Diagnostic, Label, Reporter, Source, Span, suggest
 from powderdsl.model.declarations import SHARED, PackDecl, RulesetDecl, read_file
 from powderdsl.model.types import Ruleset
-from powderdsl.syntax.sources import path_beside, read_source, shipped, shipped_names
+from powderdsl.syntax.sources import OPEN, path_beside, read_source, shipped, shipped_names
 from powderdsl.system.cache import Memo, collection_paused, persistent
 from powderdsl.system.reading import inside, is_path
 from powderdsl.system.writing import failure
@@ -274,9 +274,10 @@ def names_in_file(text: str, span: Span, reporter: Reporter) -> list[str] | None
 
 
 def _is_there(text: str) -> bool:
-    """True if a text names an existing path other than a folder."""
+    """True if a text names an existing path other than a folder, or a file that an editor has not saved yet."""
     try:
-        return os.path.exists(text) and not os.path.isdir(text)
+        there = os.path.exists(text) and not os.path.isdir(text)
+        return there or (bool(OPEN) and Path(text).resolve() in OPEN)
     except (OSError, ValueError):
         return False
 

@@ -123,8 +123,10 @@ LAYERS: dict[str, tuple[str, ...]] = {
     "experiments.studies": (*_FRONT, "compiler", "experiments.runs"),
     "web": (*_BACK, "simulation.standalone", *_WORLDS, "tasks", "tasks.tensors"),
     "web.bridge": (*_SCREEN, "simulation.standalone", *_TESTING),
+    "editing": (*_COMPILER, "worlds", "tasks", "experiments.studies"),
     "cli": (
         *_SCREEN,
+        "editing",
         "analysis.costs",
         "simulation.standalone",
         "web",
@@ -201,6 +203,8 @@ THIRD_PARTIES: dict[str, Home] = {
     "js": Home(("targets.wasm.host",), ()),
     "pyodide": Home(("targets.wasm.host",), ()),
     "click": Home(("cli",), ("cli",)),
+    "pygls": Home(("cli.commands.lsp",), ()),
+    "lsprotocol": Home(("cli.commands.lsp",), ()),
     "matplotlib": Home(("experiments.studies", "cli"), ()),
     "ray": Home(("experiments.studies.run",), ()),
 }

@@ -5,6 +5,7 @@ Places in source text are two character offsets; lines and columns are for print
 
 from __future__ import annotations
 
+import re
 from bisect import bisect_right
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
@@ -20,6 +21,8 @@ TAB_WIDTH = 4
 MAX_SHOWN = 160
 """The most characters of a source line that a diagnostic shows."""
 COLORS = {Severity.ERROR: "31;1", Severity.WARNING: "33;1", Severity.NOTE: "36;1"}
+
+MEANT = re.compile(r"did you mean `([^`]+)`\?")
 
 MAX_ERRORS = 200
 """The most errors that are reported: more would not be read."""
@@ -108,6 +111,13 @@ class Diagnostic:
         return CODES[self.code].severity
 
     @property
+    def fix(self) -> tuple[Span, str] | None:
+        """What to write at the place of a misspelled word, if the help names one word."""
+        words = [match[1] for text in self.helps if (match := MEANT.fullmatch(text))]
+        span = self.primary.span
+        return (span, words[0]) if span is not None and len(words) == 1 and span.text.strip() else None
+
+    @property
     def sort_key(self) -> tuple[str, int, int, str]:
         """The file, the place in it, and the code. Diagnostics without a place come first."""
         span = self.primary.span
@@ -194,6 +204,7 @@ def diagnostic_data(diagnostic: Diagnostic, *, utf16: bool = False) -> dict[str,
         ends = {"start": point(span.source, span.start), "end": point(span.source, span.end)}
         return {"span": {"file": span.source.name, **ends}, "text": label.text}
 
+    fix = diagnostic.fix
     return {
         "code": diagnostic.code,
         "severity": diagnostic.severity.value,
@@ -202,6 +213,7 @@ def diagnostic_data(diagnostic: Diagnostic, *, utf16: bool = False) -> dict[str,
         "secondary": [label_data(label) for label in diagnostic.secondary],
         "notes": list(diagnostic.notes),
         "helps": list(diagnostic.helps),
+        "fix": None if fix is None else label_data(Label(*fix)),
     }
 
 

@@ -13,13 +13,17 @@ from powderdsl.system.writing import failure
 MAX_BYTES = 4 * MAX_CHARACTERS
 
 
+OPEN: dict[Path, str] = {}
+"""Texts in an editor, by resolved path: read instead of their files."""
+
+
 def read_source(path: Path, reporter: Reporter, *, limit: int = MAX_BYTES) -> Source | None:
     """The text of a UTF-8 file, or None after reporting PD101 or PD102. Its name is relative where it lies below here.
 
     `limit`: bytes that it may have.
     """
     try:
-        text = read_bytes(path, limit).decode("utf-8-sig")
+        text = (OPEN and OPEN.get(path.resolve())) or read_bytes(path, limit).decode("utf-8-sig")
     except UnicodeDecodeError as error:
         reporter.error(
             "PD101", f"`{path}` is not UTF-8 text", None, notes=[f"byte {error.start} cannot be decoded"]

@@ -34,6 +34,8 @@ LIMIT = 512 << 20
 MOST = 2000
 """The most files to keep, so that searching the folder stays quick."""
 
+STORED = sys.platform != "emscripten"
+"""Whether results of stages are stored: files do not outlive a page, and editors make new ones with each key."""
 QUICK = 0.002
 """Results that took at most this many seconds are not stored."""
 
@@ -75,7 +77,7 @@ def persistent(name: str, inputs: str, make: Callable[[], T]) -> T:
         inputs: a text that differs wherever results of the stage differ.
         make: returns the result, which can be pickled.
     """
-    if sys.platform == "emscripten":  # files do not outlive the page
+    if not STORED:
         return make()
     text = f"{code_hash()}\0{sys.version}\0{name}\0{inputs}"
     key = hashlib.sha256(text.encode("utf-8", "surrogatepass")).hexdigest()[:32]

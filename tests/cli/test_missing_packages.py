@@ -78,6 +78,8 @@ QUICK = [
     ("explain PD612", WORKS, WORKS),
     ("universe 7", WORKS, WORKS),
     ("schema", WORKS, WORKS),
+    ("fmt study.yaml", WORKS, WORKS),
+    ("lsp --help", WORKS, WORKS),
 ]
 SLOW = [
     ("check sand-pushing", WORKS, WORKS),

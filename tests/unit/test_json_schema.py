@@ -11,9 +11,9 @@ from typing import Any
 import pytest
 import yaml
 
-from powderdsl.cli.commands.schema import schema
 from powderdsl.cli.commands.study import commands
 from powderdsl.diagnostics import CompileError, Reporter, Source
+from powderdsl.editing.json_schema import schema
 from powderdsl.experiments.studies.study import read_study
 from powderdsl.model.declarations import read_file
 from powderdsl.tasks.file import read_task

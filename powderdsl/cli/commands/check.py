@@ -6,6 +6,7 @@ import sys
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
@@ -17,8 +18,10 @@ from powderdsl.compiler import load_with_diagnostics, lower
 from powderdsl.diagnostics import CompileError, Diagnostic, Severity
 from powderdsl.diagnostics.diagnostic import diagnostic_data
 from powderdsl.model.types import Ruleset
+from powderdsl.syntax.sources import shipped
 from powderdsl.system.cache import persistent
 from powderdsl.system.reports import table
+from powderdsl.system.writing import write_text
 from powderdsl.tasks.shipped import is_task
 
 if TYPE_CHECKING:
@@ -50,6 +53,7 @@ class Checked:
 @click.command("check")
 @click.argument("rules", nargs=-1, required=True, metavar="RULES...")
 @opt.option("--json", bool, "One JSON list instead of text.", to="as_json")
+@opt.option("--fix", bool, "Write the words that misspelled ones mean, if that leaves fewer errors.")
 @opt.option("--notes", bool, "Also list notes, such as inactive rules.")
 @opt.option("--warnings-as-errors", bool, "Exit with 1 if there are warnings.")
 @opt.option("--quick", bool, "Check only the rules themselves; do not judge invariants.")
@@ -60,6 +64,7 @@ class Checked:
 def command(
     rules: tuple[str, ...],
     as_json: bool,
+    fix: bool,
     notes: bool,
     warnings_as_errors: bool,
     quick: bool,
@@ -78,6 +83,9 @@ def command(
     Exit code: 0 without errors, 1 with warnings under --warnings-as-errors, 2 with errors.
     """
     results = [_check(name, None if quick else prove, cost, ledger) for name in rules]
+    for number, name in enumerate(rules) if fix else ():
+        while better := _corrected(results[number], name, prove if not quick else None, as_json):
+            results[number] = better
     # Compositions share packs: a dictionary has each diagnostic once.
     shown = dict.fromkeys(
         diagnostic
@@ -150,6 +158,35 @@ def _check(name: str, prove: int | None, cost: bool, ledger: bool) -> Checked:
 
         expenses = costs(lower(ruleset))
     return Checked(name, diagnostics, ruleset, expenses, _ledger(ruleset) if ledger else None, claims)
+
+
+def _corrected(result: Checked, name: str, prove: int | None, quiet: bool) -> Checked | None:
+    """Write what misspelled words mean; the new result, or None if it has no fewer errors and files are as before."""
+    wrong = [diagnostic for diagnostic in result.diagnostics if diagnostic.fix]
+    wrong = [
+        diagnostic for diagnostic in wrong if diagnostic.code == "PD108"
+    ] or wrong  # names depend on keys
+    fixes = dict(diagnostic.fix for diagnostic in wrong if diagnostic.fix)
+    ours = shipped("rules").parent.resolve()
+    texts: dict[Path, str] = {}
+    for span in sorted(fixes, key=lambda span: -span.start):
+        path = Path(span.source.name)
+        if ours in path.resolve().parents:
+            continue
+        text = texts.setdefault(path, span.source.text)
+        texts[path] = text[: span.start] + fixes[span] + text[span.end :]
+    before = {path: path.read_bytes() for path in texts}
+    for path, text in texts.items():
+        write_text(path, text)
+    better = _check(name, prove, cost=False, ledger=False) if texts else result
+    if better.number(Severity.ERROR) >= result.number(Severity.ERROR):
+        for path, data in before.items():
+            path.write_bytes(data)
+        return None
+    for span, word in fixes.items() if not quiet else ():
+        if Path(span.source.name) in texts:
+            click.echo(f"fixed {span.place}: `{span.text}` is now `{word}`")
+    return better
 
 
 def _judged(ruleset: Ruleset, prove: int) -> tuple[tuple[Diagnostic, ...], tuple[dict[str, Any], ...]]:

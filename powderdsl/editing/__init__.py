@@ -1,0 +1,1 @@
+"""What editors show of files: completion, hover texts, places of names, fixes, and one layout."""

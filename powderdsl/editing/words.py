@@ -1,0 +1,88 @@
+"""The words of loaded rules: what each names, where it is defined, and where it occurs."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+
+from powderdsl.diagnostics import Source, Span
+from powderdsl.model.builtins import COORDINATES, DIRECTION_SETS, DIRECTIONS, KERNELS
+from powderdsl.model.declarations import (
+    Definition,
+    ElementDecl,
+    FieldDecl,
+    KernelDecl,
+    PackDecl,
+    ParamDecl,
+    PassDecl,
+    PropertyDecl,
+    SetDecl,
+    StreamDecl,
+    TagDecl,
+)
+from powderdsl.model.operations import FUNCTIONS
+from powderdsl.syntax.parse import reserved_words
+
+KINDS: dict[type[Definition], str] = {
+    ElementDecl: "element",
+    TagDecl: "tag",
+    PropertyDecl: "property",
+    FieldDecl: "field",
+    ParamDecl: "parameter",
+    SetDecl: "set",
+    KernelDecl: "kernel",
+    StreamDecl: "stream",
+    PassDecl: "pass",
+}
+"""What definitions are called."""
+
+TEXT = re.compile(r'(^|\s)#.*$|\babout:\s*("[^"]*"|[^,}\n]*)', re.MULTILINE)
+"""Comments and sentences: no names stand in them."""
+
+
+@dataclass(frozen=True)
+class Word:
+    """A word of the rules. `span` is where a file defines it; words of the language have none."""
+
+    name: str
+    kind: str
+    about: str = ""
+    span: Span | None = None
+    pack: str = ""
+
+
+def definitions(packs: Sequence[PackDecl]) -> Iterator[Word]:
+    """The words that packs define, in the order of the files."""
+    for pack in packs:
+        sections = (
+            pack.elements, pack.tags, pack.properties, pack.fields, pack.params, pack.sets, pack.kernels, pack.streams,
+            pack.passes,
+        )  # fmt: skip
+        for section in sections:
+            for entry in section:
+                about = getattr(entry, "about", "")
+                yield Word(entry.name.text, KINDS[type(entry)], about, entry.name.span, pack.name.text)
+
+
+def language_words() -> Iterator[Word]:
+    """The words of the language itself."""
+    for function in FUNCTIONS.values():
+        yield Word(function.name, "function", f"`{function.usage}`: {function.about}")
+    for kind, names in (("direction", DIRECTIONS), ("directions", DIRECTION_SETS), ("kernel", KERNELS)):
+        for name in names:
+            yield Word(name, kind)
+    for name in sorted(
+        {*reserved_words(), *COORDINATES} - {*FUNCTIONS, *DIRECTIONS, *DIRECTION_SETS, *KERNELS}
+    ):
+        yield Word(name, "keyword")
+
+
+def occurrences(name: str, sources: Iterable[Source]) -> Iterator[Span]:
+    """The places of a name in the lines of files."""
+    pattern = re.compile(rf"(?<![\w]){re.escape(name)}(?![\w])")
+    for source in sources:
+        hidden = [match.span() for match in TEXT.finditer(source.text)]
+        for match in pattern.finditer(source.text):
+            if not any(begin <= match.start() < end for begin, end in hidden):
+                yield Span(source, match.start(), match.end())

@@ -1,0 +1,242 @@
+"""Files that are open in an editor: their mistakes, and what the editor shows at a place."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from powderdsl.compiler import load_with_diagnostics, read, shipped_rules
+from powderdsl.diagnostics import CompileError, Diagnostic, Reporter, Source, Span
+from powderdsl.editing.cursor import Cursor, cursor_at, keys_at, values_at
+from powderdsl.editing.words import Word, definitions, language_words, occurrences
+from powderdsl.experiments.studies.study import Commands
+from powderdsl.model.builtins import RESERVED
+from powderdsl.model.declarations import PackDecl
+from powderdsl.model.schema import NAME
+from powderdsl.model.types import Ruleset
+from powderdsl.syntax.parse import reserved_words
+from powderdsl.syntax.sources import OPEN, shipped
+from powderdsl.syntax.yaml_tree import Mapping, Node, Scalar, parse_yaml
+
+KIND = re.compile(r"^(pack|ruleset|task|study|scenes?):", re.MULTILINE)
+PACKS = ("needs", "packs", "without", "provides", "conflicts", "extends", "rules", "rulesets")
+"""Keys whose values name packs or rulesets."""
+
+
+@dataclass(frozen=True)
+class Item:
+    """A completion: a word, what kind of word, and what it means."""
+
+    label: str
+    kind: str
+    about: str = ""
+
+
+@dataclass(frozen=True)
+class Symbol:
+    """An entry of the outline: a key, its line, and what is below it."""
+
+    name: str
+    span: Span
+    whole: Span
+    below: tuple[Symbol, ...] = ()
+
+
+@dataclass
+class Rules:
+    """What was last read for a file: its packs, and the model of the last text without mistakes."""
+
+    packs: list[PackDecl] = field(default_factory=list)
+    model: Ruleset | None = None
+    words: dict[str, list[Word]] = field(default_factory=dict)
+
+    @property
+    def sources(self) -> list[Source]:
+        return [pack.source for pack in self.packs]
+
+
+class Workspace:
+    """The open files.
+
+    `beside` names rules that packs are checked with, besides those that they need. `commands` gives the commands that steps
+    of studies may call.
+    """
+
+    def __init__(self, beside: str = "", commands: Callable[[], Commands] = dict):
+        self.beside, self.commands = beside, commands
+        self.rules: dict[Path, Rules] = {}
+        self._language = [*language_words()]
+
+    def open(self, path: Path, text: str) -> None:
+        """A file is open, or its text has changed."""
+        OPEN[path.resolve()] = text
+
+    def close(self, path: Path) -> None:
+        """A file is no longer open."""
+        OPEN.pop(path.resolve(), None)
+        self.rules.pop(path, None)
+
+    def text(self, path: Path) -> str:
+        return OPEN[path.resolve()]
+
+    def kind(self, path: Path) -> str:
+        """The key that says what a file is; `pack` if none does yet."""
+        match = KIND.search(self.text(path))
+        return match[1] if match else "pack"
+
+    # Mistakes
+
+    def check(self, path: Path) -> tuple[Diagnostic, ...]:
+        """What `powderdsl check --quick --notes` says of a file, in all files that it needs.
+
+        Nothing of other YAML files, which have none of our first keys.
+        """
+        if not KIND.search(self.text(path)):
+            return ()
+        known = self.rules.setdefault(path, Rules())
+        names = [name for name in (self.beside, str(path)) if name]
+        try:
+            match self.kind(path):
+                case "task":
+                    from powderdsl.tasks.shipped import load_task_with_diagnostics
+
+                    task, remarks = load_task_with_diagnostics(str(path))
+                    known.model, names = task.ruleset, [*map(str, task.rules)]
+                case "study":
+                    from powderdsl.experiments.studies.study import load_study
+
+                    load_study(str(path), self.commands())
+                    return ()
+                case "scene" | "scenes":
+                    from powderdsl.worlds.scene.read import read_scenes
+
+                    reporter = Reporter()
+                    read_scenes(Source(str(path), self.text(path)), reporter)
+                    return reporter.diagnostics
+                case _:
+                    known.model, remarks = load_with_diagnostics(*names)
+        except CompileError as error:
+            remarks = error.diagnostics
+        packs = read(names, Reporter())[0] if self.kind(path) != "study" else []
+        if packs:
+            known.packs, known.words = packs, {}
+            for word in (*self._language, *definitions(packs)):
+                known.words.setdefault(word.name, []).append(word)
+        return remarks
+
+    # At a place
+
+    def complete(self, path: Path, offset: int) -> list[Item]:
+        """The words that fit at a place."""
+        text, kind = self.text(path), self.kind(path)
+        cursor = cursor_at(text, offset)
+        if cursor.key is None and (keys := keys_at(cursor.path, kind)):
+            return [Item(key, "key", about) for key, about in keys.items()]
+        if choices := values_at(cursor.keys, kind):
+            return [Item(choice, "value") for choice in choices]
+        last = cursor.keys[-1] if cursor.keys else ""
+        if last in PACKS:
+            beside = sorted(other.stem for other in path.parent.glob("*.yaml") if other != path)
+            return [Item(name, "pack") for name in dict.fromkeys([*beside, *shipped_rules()])]
+        words = [entry for entries in self._rules(path).words.values() for entry in entries]
+        if last in ("tags", "after", "before"):
+            wanted = "tag" if last == "tags" else "pass"
+            words = [word for word in words if word.kind == wanted]
+        elif last == "about":
+            words = []
+        return [
+            Item(word.name, word.kind, word.about) for word in words if word.kind != "pass" or last != "do"
+        ]
+
+    def hover(self, path: Path, offset: int) -> tuple[str, Span] | None:
+        """What the word at a place means, as Markdown, and its place."""
+        text = self.text(path)
+        cursor = cursor_at(text, offset)
+        if not cursor.word:
+            return None
+        span = Span(Source(str(path), text), cursor.start, cursor.end)
+        if cursor.key is None or text[cursor.end : cursor.end + 1] == ":":
+            about = keys_at(cursor.path, self.kind(path)).get(cursor.word)
+            if about:
+                return f"`{cursor.word}`: {about}", span
+        rules = self._rules(path)
+        parts = [_described(word, rules.model) for word in rules.words.get(cursor.word, ())]
+        return ("\n\n".join(parts), span) if parts else None
+
+    def definition(self, path: Path, offset: int) -> list[Span]:
+        """Where the word at a place is defined."""
+        cursor = cursor_at(self.text(path), offset)
+        found = [word.span for word in self._rules(path).words.get(cursor.word, ()) if word.span is not None]
+        if found:
+            return found
+        packs = {pack.name.text: pack.name.span for pack in self._rules(path).packs}
+        return [packs[cursor.word]] if cursor.word in packs else []
+
+    def references(self, path: Path, offset: int) -> list[Span]:
+        """Where the name at a place occurs, in all files that are loaded with this one."""
+        cursor, rules = cursor_at(self.text(path), offset), self._rules(path)
+        if not any(entry.span is not None for entry in rules.words.get(cursor.word, ())):
+            return []
+        own = _namespace(cursor)
+        places = occurrences(cursor.word, rules.sources)
+        return [span for span in places if _namespace(cursor_at(span.source.text, span.start)) == own]
+
+    def rename(self, path: Path, offset: int, name: str) -> list[Span]:
+        """The places to write another name. Raises ValueError if that would change what the rules say."""
+        spans, rules = self.references(path, offset), self._rules(path)
+        if not spans:
+            raise ValueError("this is not a name that a file defines")
+        if not NAME.match(name) or name in RESERVED or name in reserved_words():
+            raise ValueError(f"`{name}` cannot be a name")
+        if name in rules.words:
+            raise ValueError(f"`{name}` is a name already")
+        shipped_here = shipped("rules").resolve()
+        for span in spans:
+            file = Path(span.source.name).resolve()
+            if file.parent == shipped_here and file not in OPEN:
+                raise ValueError(f"{span.source.name} comes with powderdsl and uses it, too")
+        return spans
+
+    def outline(self, path: Path) -> tuple[Symbol, ...]:
+        """The sections of a file and their entries."""
+        tree = parse_yaml(Source(str(path), self.text(path)), Reporter())
+        return _symbols(tree, 2)
+
+    def _rules(self, path: Path) -> Rules:
+        if path not in self.rules:
+            self.check(path)
+        return self.rules[path]
+
+
+def _namespace(cursor: Cursor) -> str:
+    """What a word at a place names: a pack or a pass, which have names of their own, or anything else."""
+    if cursor.key in PACKS or cursor.keys in (("pack",), ("ruleset",)):
+        return "pack"
+    is_pass = (cursor.path == ("passes",) and cursor.key is None) or cursor.key in ("after", "before")
+    return "pass" if is_pass else "name"
+
+
+def _symbols(node: Node | None, depth: int) -> tuple[Symbol, ...]:
+    if depth == 0 or node is None or isinstance(node, Scalar):
+        return ()
+    parts = (
+        node.entries
+        if isinstance(node, Mapping)
+        else [entry for item in node.items if isinstance(item, Mapping) for entry in item.entries[:1]]
+    )
+    return tuple(
+        Symbol(key.text, key.span, key.span.to(value.span), _symbols(value, depth - 1))
+        for key, value in parts
+    )
+
+
+def _described(word: Word, model: Ruleset | None) -> str:
+    """A word as Markdown: what it is, where it comes from, and its values."""
+    title = f"**{word.kind}** `{word.name}`" + (f" of pack `{word.pack}`" if word.pack else "")
+    lines = [title + (f": {word.about}" if word.about else "")]
+    element = next((one for one in model.elements if one.name == word.name), None) if model else None
+    if element is not None and word.kind == "element":
+        lines.append(f"id {element.id}, color {element.color}")
+    return "\n\n".join(lines)
