@@ -448,12 +448,16 @@ ABSENT = (
     "rl",
     "worldmodel",
     "experiments",
+    "tasks",
+    "data/tasks",
+    "testing/mutation",
     "targets/cuda",
     "web/page",
     "web/parts",
     "web/made",
+    "web/site.py",
 )
-"""Parts of powderdsl that Pyodide does not need: the command line, what requires torch, and the page itself."""
+"""Parts of powderdsl that `web/bridge.py` does not import: the command line, what requires torch, and the page itself."""
 
 
 @cache
@@ -463,13 +467,13 @@ def python_archive() -> bytes:
     with zipfile.ZipFile(out, "w", zipfile.ZIP_DEFLATED) as archive:
         for path in sorted(HERE.parent.rglob("*")):
             name = path.relative_to(HERE.parent).as_posix()
-            if path.is_file() and "__pycache__" not in path.parts and not name.startswith(ABSENT):
+            native = path.suffix in (".h", ".hpp", ".cu") or "__pycache__" in path.parts
+            if path.is_file() and not native and not name.startswith(ABSENT):
                 _add(archive, f"powderdsl/{name}", path.read_bytes())
-        for folder in ("rules", "tasks"):
-            for path in sorted(shipped(folder).rglob("*.yaml")):
-                name = f"powderdsl/data/{folder}/{path.relative_to(shipped(folder)).as_posix()}"
-                if name not in archive.namelist():
-                    _add(archive, name, path.read_bytes())
+        for path in sorted(shipped("rules").rglob("*.yaml")):
+            name = f"powderdsl/data/rules/{path.relative_to(shipped('rules')).as_posix()}"
+            if name not in archive.namelist():
+                _add(archive, name, path.read_bytes())
         for library in LIBRARIES:
             for file in metadata.files(library) or ():
                 if not (".." in file.parts or "__pycache__" in file.parts or file.suffix in (".so", ".pyd")):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import base64
 import gzip
 import hashlib
@@ -163,9 +164,34 @@ def test_the_archive_for_pyodide_is_the_compiler() -> None:
         names = set(archive.namelist())
     assert {"powderdsl/web/bridge.py", "powderdsl/data/rules/sand.yaml"} <= names
     assert {"lark/__init__.py", "yaml/__init__.py"} <= names
-    absent = ("powderdsl/rl", "powderdsl/cli", "click")
-    assert not [name for name in names if name.endswith((".so", ".pyc")) or name.startswith(absent)]
+    absent = ("powderdsl/rl", "powderdsl/cli", "powderdsl/tasks", "click")
+    assert not [name for name in names if name.endswith((".so", ".pyc", ".hpp")) or name.startswith(absent)]
     assert site_module.python_archive() == site_module.python_archive.__wrapped__()
+
+
+def test_the_archive_has_what_the_bridge_imports() -> None:
+    root = PAGE.parents[1]
+
+    def imported(path: Path) -> set[Path]:
+        """The files of modules that one imports anywhere."""
+        names = set()
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.ImportFrom) and node.module:
+                names |= {node.module, *(f"{node.module}.{alias.name}" for alias in node.names)}
+        places = [root.parent.joinpath(*name.split(".")) for name in names if name.startswith("powderdsl")]
+        files = {place.with_suffix(".py") for place in places} | {place / "__init__.py" for place in places}
+        return {file for file in files if file.is_file()}
+
+    waiting, needed = [PAGE.parent / "bridge.py"], set[Path]()
+    while waiting:
+        path = waiting.pop()
+        if path not in needed and "cuda" not in path.parts:
+            needed.add(path)
+            waiting += imported(path)
+    with zipfile.ZipFile(BytesIO(site_module.python_archive())) as archive:
+        names = set(archive.namelist())
+    assert len(needed) > 100
+    assert {path.relative_to(root.parent).as_posix() for path in needed} <= names
 
 
 def test_the_licenses_of_all_parts_are_there(site: Site) -> None:
