@@ -119,6 +119,7 @@ async function saveFilm(make, name) {
 /** Begins a recording, or ends one and saves it: as a video where the browser can. */
 app.record = async () => {
   const on = recorder.toggle();
+  $("canvas").classList.toggle("recording", on);
   $("record").textContent = on ? "End the recording (M)" : "Record (M)";
   if (on) {
     setRunning(true);
