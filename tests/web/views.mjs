@@ -37,7 +37,7 @@ await embedded.close();
 // The GPU draws what the processor draws, also where cells of all elements move.
 const page = await open("play.html");
 seen.pixels = await page.evaluate(async () => {
-  const { Painter, Screen } = await import("./view.js");
+  const { Painter, Screen, image } = await import("./view.js");
   const { generator } = await import("./engine.js");
   const { engine } = powderdsl;
   const { rows, columns } = engine;
@@ -56,11 +56,8 @@ seen.pixels = await page.evaluate(async () => {
     const canvas = Object.assign(document.createElement("canvas"), { width: columns, height: rows });
     const screen = new Screen(canvas, true);
     screen.show(one, tint);
-    const drawn = new Uint8Array(4 * engine.cells);
-    screen.gl.readPixels(0, 0, columns, rows, screen.gl.RGBA, screen.gl.UNSIGNED_BYTE, drawn);
-    const wanted = one.draw(tint).data;
-    const row = 4 * columns;
-    found[name] = wanted.filter((value, at) => value !== drawn[(rows - 1 - Math.floor(at / row)) * row + (at % row)]).length;
+    const drawn = image(screen, one, tint).data;
+    found[name] = one.draw(tint).data.filter((value, at) => value !== drawn[at]).length;
   }
   painter.draw(true);
   found.colors = new Set(painter.pixels).size;

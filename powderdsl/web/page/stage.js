@@ -4,7 +4,7 @@ import { blindColors, darkColors } from "./colors.js";
 import { $ } from "./dom.js";
 import { showReadings } from "./readings.js";
 import { app } from "./state.js";
-import { Painter, Screen } from "./view.js";
+import { Painter, Screen, image } from "./view.js";
 
 const STEP_BUDGET = 11; // ms of a frame that steps may take
 const CHECKPOINT_EVERY = 32; // steps of small worlds; fewer of large ones, which take longer to copy
@@ -113,7 +113,7 @@ function frame(now) {
     dirty = false;
     const tint = $("tint").checked;
     screen.show(app.painter, tint);
-    app.drawn?.(() => app.painter.draw(tint));
+    app.drawn?.(() => image(screen, app.painter, tint));
     const [, , step] = app.engine.clock();
     $("clock").textContent = `step ${step}`;
     showReadings(now);

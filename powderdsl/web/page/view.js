@@ -183,6 +183,17 @@ export class Screen {
   }
 }
 
+/** The picture that a screen shows, without drawing it again. @param {Screen} screen @param {Painter} painter */
+export function image({ gl }, painter, tint) {
+  if (!gl) return painter.draw(tint);
+  const { rows, columns } = painter.engine;
+  const upward = new Uint8Array(4 * rows * columns);
+  gl.readPixels(0, 0, columns, rows, gl.RGBA, gl.UNSIGNED_BYTE, upward);
+  const found = new ImageData(columns, rows);
+  for (let y = 0; y < rows; y++) found.data.set(upward.subarray(4 * columns * (rows - 1 - y), 4 * columns * (rows - y)), 4 * columns * y);
+  return found;
+}
+
 const random = generator(Date.now());
 
 /**
