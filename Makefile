@@ -55,6 +55,10 @@ demo: $(VENV)/.core  ## run a designed world and write demo.gif
 web: tests/web/node_modules  ## fetch Pyodide and the editor, for `powderdsl play`, the wheel and the tests
 	@node tests/web/parts.mjs
 
+vscode:  ## build dist/powderdsl.vsix, the extension for VS Code
+	@mkdir -p dist
+	@cd editors/vscode && npm ci --no-audit --no-fund --loglevel=error && npm run --silent package
+
 test: $(VENV)/.ready  ## run the tests (ARGS=... for pytest, JOBS=0 for one process)
 	@$(BIN)/python -m pytest --numprocesses $(JOBS) --maxprocesses 4 --dist worksteal $(ARGS)
 
