@@ -19,7 +19,7 @@ test test-all golden: export OMP_NUM_THREADS ?= 1
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help setup demo test test-all check lint types format golden web wheel clean distclean mutation fuzz
+.PHONY: help setup demo test test-all check lint types format golden web vscode wheel clean distclean mutation fuzz
 
 help:  ## list these targets
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/\1|\2/p' $(MAKEFILE_LIST) | while IFS='|' read -r name about; do printf '  make %-10s %s\n' "$$name" "$$about"; done
