@@ -151,7 +151,7 @@ def meaning_of(ruleset: Ruleset, memo: Memo) -> tuple[object, object]:
 NOTICED = ("check", "invariant", "test", "generated")
 """The checks that may notice a mutant. `test`: tests written by hand; most run before invariants."""
 
-PROOF = 10.0
+PROOF = 30.0
 """Seconds of work, counted, for a proof that a mutant is equal, of the passes that it changes."""
 
 PAIRED = 6
