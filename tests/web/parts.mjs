@@ -14,25 +14,17 @@ const DISTRIBUTED = [
   ),
   ...["common", "highlight", "lr", "yaml"].map((name) => `@lezer/${name}`),
 ];
-const EDITOR = {
-  ...Object.fromEntries(DISTRIBUTED.map((name) => [name, "dist/index.js"])),
-  "@marijn/find-cluster-break": "src/index.js",
-  crelt: "index.js",
-  "style-mod": "src/style-mod.js",
-  "w3c-keyname": "index.js",
-};
+const EDITOR = [...DISTRIBUTED, "@marijn/find-cluster-break", "crelt", "style-mod", "w3c-keyname"];
 
 rmSync(parts, { recursive: true, force: true });
 mkdirSync(join(parts, "pyodide"), { recursive: true });
-mkdirSync(join(parts, "editor"), { recursive: true });
 mkdirSync(join(parts, "licenses"));
 const versions = [];
-for (const [name, file] of [["pyodide", null], ...Object.entries(EDITOR)]) {
+for (const name of ["pyodide", ...EDITOR]) {
   const folder = join(modules, name);
   const about = JSON.parse(readFileSync(join(folder, "package.json"), "utf8"));
   const flat = name.replace("@", "").replace("/", "-");
   versions.push(`${name} ${about.version}, ${about.license}`);
-  if (file) cpSync(join(folder, file), join(parts, "editor", `${flat}.js`));
   const license = ["LICENSE", "LICENSE.md"].map((one) => join(folder, one)).find((one) => existsSync(one));
   if (license) cpSync(license, join(parts, "licenses", `${flat}.txt`));
 }

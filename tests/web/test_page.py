@@ -29,7 +29,7 @@ def needed() -> str:
     """What is missing for these tests; empty if nothing is."""
     if shutil.which("node") is None or not (HERE / "node_modules" / "playwright-core").is_dir():
         return "the page is tested with Node.js and playwright-core: `make web` fetches it with npm"
-    if not PARTS.is_dir():
+    if not (PARTS / "editor.js").is_file():
         return "the page needs Pyodide and CodeMirror: `make web` fetches them with npm"
     return "" if CHROMIUM else "the page is tested in Chromium: apt install chromium-headless-shell"
 

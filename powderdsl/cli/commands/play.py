@@ -36,7 +36,7 @@ def command(
     """
     from powderdsl.web.site import PARTS, Entry, Site
 
-    if not PARTS.is_dir():
+    if not (PARTS / "editor.js").is_file():
         raise BadInput(
             "this installation lacks Pyodide and the editor, which the page needs: run `make web` in a clone of the "
             "repository, then `powderdsl play` there, or `make wheel` for a wheel that has them"
