@@ -16,7 +16,7 @@ export function executable() {
 }
 
 export async function launch() {
-  return chromium.launch({ executablePath: executable(), args: ["--no-sandbox", "--disable-gpu"] });
+  return chromium.launch({ executablePath: executable(), args: ["--no-sandbox", "--disable-gpu", "--js-flags=--expose-gc"] });
 }
 
 /** `before` is run in the page before its own scripts. */
@@ -27,7 +27,7 @@ export async function openPage(browser, address, { before, ...options } = {}) {
   page.on("console", (message) => {
     if (["error", "warning"].includes(message.type())) problems.push(message.text());
   });
-  page.on("pageerror", (error) => problems.push(String(error)));
+  page.on("pageerror", (error) => problems.push(String(error.stack ?? error).slice(0, 400)));
   await page.goto(address);
   await page.waitForFunction(() => globalThis.powderdsl?.firstWorld);
   return { page, problems };
@@ -36,7 +36,11 @@ export async function openPage(browser, address, { before, ...options } = {}) {
 /** What tests do with a page again and again. */
 export function tools(page) {
   const text = (id) => page.locator(`#${id}`).textContent();
-  const until = (test, argument) => page.waitForFunction(test, argument, { timeout: 60000 });
+  const until = (test, argument) =>
+    page.waitForFunction(test, argument, { timeout: 60000 }).catch(async (error) => {
+      const words = await page.evaluate(() => ["status", "compiler", "problems"].map((id) => document.getElementById(id).textContent));
+      throw new Error(`${error.message} ${test}: ${words.join(" | ").slice(0, 600)}`);
+    });
   const said = (id, pattern) =>
     until(([name, source]) => new RegExp(source).test(document.getElementById(name).textContent), [id, pattern.source]);
   const settled = () => until(() => !powderdsl.swapping);
@@ -68,11 +72,16 @@ export function tools(page) {
       },
       [from, to],
     );
+  /** The compiler is there; it may take longer here than people want to wait, since other tests run. */
+  const ready = async () => {
+    await until(() => globalThis.powderdsl?.compilerReady && powderdsl.linkOpened && powderdsl.edits);
+    await page.evaluate(() => (powderdsl.edits.compiler.limit = 60_000));
+  };
   const applied = () => until(() => powderdsl.edits.applyTook !== null);
   const files = () => page.evaluate(() => Object.keys(powderdsl.edits.files));
   async function paint(x, y) {
     const box = await page.locator("#canvas").boundingBox();
     await page.mouse.click(box.x + box.width * x, box.y + box.height * y);
   }
-  return { text, until, said, settled, state, count, choose, edit, applied, files, paint };
+  return { text, until, ready, said, settled, state, count, choose, edit, applied, files, paint };
 }

@@ -5,7 +5,7 @@ import { launch, openPage, tools } from "./browser.mjs";
 const [address, folder] = process.argv.slice(2);
 const browser = await launch();
 const { page, problems } = await openPage(browser, address);
-const { text, until, said, settled, state, choose, edit, applied, files } = tools(page);
+const { text, until, ready, said, settled, state, choose, edit, applied, files } = tools(page);
 const seen = {};
 
 const tabs = (page) => page.locator("#packs .pack").allInnerTexts();
@@ -19,7 +19,7 @@ const own = (name, more = "") => `pack: ${name}\nabout: One.\nelements:\n  ${nam
 const element = (name) => until((one) => powderdsl.engine.elements.some((each) => each.name === one), name);
 
 await page.locator("#run").click();
-await until(() => powderdsl.compilerReady && powderdsl.linkOpened);
+await ready();
 await said("problems", /No mistakes/);
 
 // Two dropped files both open, one of a name that is there replaces it, and all of it can be undone.

@@ -12,6 +12,7 @@ from typing import Any
 import pytest
 
 from powderdsl.web.site import Site, SiteServer
+from tests.tiers import tiered
 from tests.web.test_page import HERE, needed
 from tests.wheels import succeed
 
@@ -109,3 +110,10 @@ def test_files_links_and_tests(address: str, tmp_path: Path) -> None:
     assert found["hash"] < 30_000
     assert "my.npz" in found["message"]
     assert "/tmp" not in found["message"]
+
+
+@pytest.mark.parametrize("seed", tiered(range(1, 11), [1]))
+def test_random_actions_lose_nothing(address: str, tmp_path: Path, seed: int) -> None:
+    found = script("actions.mjs", address, tmp_path, "500", str(seed))
+    assert (found["actions"], found["reloads"], found["lost"]) == (500, 5, [])
+    assert max(found["heap"]) <= 2 * found["heap"][0] + 8

@@ -6,7 +6,7 @@ const browser = await launch();
 const { page, problems } = await openPage(browser, address);
 const seen = {};
 
-const { text, until, said, settled, state, count, choose, edit, applied, files, paint } = tools(page);
+const { text, until, ready, said, settled, state, count, choose, edit, applied, files, paint } = tools(page);
 
 // While the compiler loads: sizes, seeds and worlds can be undone, and a painted world keeps its cells.
 await page.locator("#run").click();
@@ -81,7 +81,7 @@ seen.failed = (await state()).menus[0];
 await page.unroute("**/rules/wireworld*");
 
 // Rules that are chosen while edited ones are compiled: those that were chosen run.
-await until(() => powderdsl.compilerReady && powderdsl.linkOpened);
+await ready();
 await said("problems", /No mistakes/);
 await page.evaluate(() => {
   const { compiler } = powderdsl.edits;

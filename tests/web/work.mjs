@@ -6,7 +6,7 @@ const [address, folder] = process.argv.slice(2);
 const browser = await launch();
 const context = await browser.newContext({ viewport: { width: 1440, height: 900 } });
 const { page, problems } = await openPage(context, address);
-const { text, until, said, settled, state, edit, applied, paint } = tools(page);
+const { text, until, ready, said, settled, state, edit, applied, paint } = tools(page);
 const seen = {};
 
 // A reload loses nothing: neither the world, nor a text with a mistake, nor settings.
@@ -19,7 +19,6 @@ const whole = () =>
     const speed = document.getElementById("speed").value;
     return JSON.stringify([files, off, shown, ids.join(), values, clock.map(String), engine.values, named, start.ids.join(), element, speed]);
   });
-const ready = () => until(() => powderdsl.compilerReady && powderdsl.linkOpened && powderdsl.edits);
 await page.locator("#run").click();
 await ready();
 await said("problems", /No mistakes/);
@@ -62,7 +61,7 @@ await said("status", /world of the link/);
 seen.link = [await text("status"), (await state()).key];
 await page.screenshot({ path: join(folder, "link.png") });
 await page.goBack();
-await said("status", /earlier work/);
+await said("status", /This is your earlier work/);
 seen.wentBack = await same();
 await page.goForward();
 await until(() => powderdsl.rules.key === "life");

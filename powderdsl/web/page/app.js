@@ -100,8 +100,7 @@ async function begin() {
   $("side").classList.add("closed");
   app.catalog = await (await get("catalog.json")).json();
   const first = app.catalog.rules.find((one) => one.key === asked.get("rules")) ?? app.catalog.rules[0];
-  const isNew = embedded || asked.has("rules");
-  app.isBack = !isNew && (await restore().catch((error) => console.info(`powderdsl: ${error}`)));
+  app.isBack = !embedded && (await restore().catch((error) => console.info(`powderdsl: ${error}`)));
   if (!app.isBack) await openRules(first.key, { size: first.sizes[0].join("x"), run: !isStill() });
   app.firstWorld = performance.now();
   // The rest comes after the first picture: the editor, and Python in a worker.

@@ -80,7 +80,16 @@ rules.onApplied.push(() => {
 
 // Why a cell changed: the steps since a checkpoint are repeated until the last one that changed its element.
 
-app.explain = async ([row, column]) => {
+let asked = 0;
+let tracing = Promise.resolve();
+
+/** Explains the cell that was asked about last: one at a time, since a trace may take seconds. */
+app.explain = (cell) => {
+  const mine = ++asked;
+  tracing = tracing.then(() => mine === asked && explain(cell));
+};
+
+async function explain([row, column]) {
   setRunning(false);
   showPanel("checks");
   why.replaceChildren(make("p", { class: "soft" }, "Looking for the step that changed the cell…"));
@@ -99,7 +108,7 @@ app.explain = async ([row, column]) => {
   } catch (error) {
     why.replaceChildren(make("p", { class: "bad" }, String(error.message ?? error)));
   }
-};
+}
 
 /** What a trace says about the element, with a link to the rule. */
 function sentence({ slots, writes }, row, column, step, changed) {

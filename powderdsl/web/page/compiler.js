@@ -13,8 +13,8 @@ class Compiler {
   /** @param {(stage: string) => void} onStage  told about each stage of loading, then `ready` */
   constructor(onStage) {
     this.onStage = onStage;
-    this.ready = false;
-    this.next = 1;
+    this.limit = LIMIT; // of compilations
+    [this.ready, this.next] = [false, 1];
     /** @type {Map<number, {resolve: Function, reject: Function, message: object, timer: number | null, limit: number}>} */
     this.open = new Map();
     /** The last files that were sent, so that a fresh worker knows them. */
@@ -91,7 +91,7 @@ class Compiler {
     const id = this.next++;
     return new Promise((resolve, reject) => {
       const message = { id, name, args };
-      this.open.set(id, { resolve, reject, message, timer: null, limit: LIMITS[name] ?? LIMIT });
+      this.open.set(id, { resolve, reject, message, timer: null, limit: LIMITS[name] ?? this.limit });
       if (!this.ready) return;
       this.worker.postMessage(message);
       if (this.open.size === 1) this._watch(id);

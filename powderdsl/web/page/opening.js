@@ -137,9 +137,7 @@ export function resize() {
 
 /**
  * Opens the work of a link or a file, or one that the browser has kept: changed files are compiled, unless the module is
- * there. Says `words` then. Resolves to whether it is open.
- * @param {{key: string, sheet?: any, files: Record<string, string> | null, off: string[], good?: any, shown?: string,
- *   module?: WebAssembly.Module, parameters: Record<string, number>, world: Snapshot, start?: Snapshot, named?: any}} found
+ * there. Says `words` then. Resolves to whether it is open. `found` is what share.js reads, or what store.js keeps.
  */
 export function openWork(found, { words, run = false, work } = {}) {
   const { files, key, off, parameters, world } = found;
@@ -150,13 +148,10 @@ export function openWork(found, { words, run = false, work } = {}) {
     const edited = files !== null || String(off) !== String(sheet.off);
     const own = { files: files ?? sheet.files, off };
     const isShipped = !edited && hasModule(key, rows, columns);
-    let module = found.module ?? (isShipped ? await shippedModule(key, rows, columns) : null);
-    if (!module) {
-      say("Compiling the rules…");
-      const { compile } = await import("./rules.js");
-      module = await compile(found.good ?? own, rows, columns);
-    }
     const good = found.good ?? own;
+    let module = found.module ?? (isShipped ? await shippedModule(key, rows, columns) : null);
+    if (!module) say("Compiling the rules…");
+    module ??= await (await import("./rules.js")).compile(good, rows, columns);
     // Rules with mistakes and no earlier ones without: those of the site run, until the mistakes are gone.
     const runs = module ?? (await shippedModule(key, ...listedRules(key).sizes[0]));
     const engine = await Engine.start(runs);
@@ -164,10 +159,9 @@ export function openWork(found, { words, run = false, work } = {}) {
       const shown = found.shown ?? Object.keys(files ?? {}).find((name) => files[name] !== sheet.files[name]);
       const edits = edited ? { ...own, good: module ? good : sheet, shown, edited } : null;
       const named = found.named ?? { world: "", seed: String(world.clock[0]), from: found.from };
-      const compiled = edited && module !== null;
-      const start = found.start ?? world;
-      const painted = found.painted ?? true;
-      const kept = land({ sheet, module: runs, compiled, edits, parameters, world, start, named, painted, work: work ?? newWork() }, engine);
+      const { painted = true, start = world } = found;
+      const rest = { sheet, module: runs, compiled: edited && module !== null, parameters, painted, work: work ?? newWork() };
+      const kept = land({ ...rest, edits, world, start, named }, engine);
       setRunning(run);
       if (module) say([words || sheet.about, kept].filter(Boolean).join(" "));
       else say("The rules have mistakes: see the list below the editor.", true);

@@ -109,6 +109,7 @@ function showTabs() {
 
 /** Puts a field for another name in the place of a tab. */
 function askName(name) {
+  if (rules.naming) return;
   const at = Object.keys(rules.files).indexOf(name);
   const field = make("input", { "aria-label": `Another name for ${packOf(name)}`, size: 12, maxlength: 60 });
   field.value = packOf(name);
@@ -183,6 +184,7 @@ function removeFile(name) {
 function exchange(texts, like = rules.moment()) {
   const all = { ...like.files, ...rules.files, ...texts };
   const kept = Object.keys(all).filter((name) => (name in texts ? texts : rules.files)[name] !== undefined);
+  if (!kept.length) return; // rules need a file
   rules.files = Object.fromEntries(kept.map((name) => [name, all[name]]));
   rules.off = new Set(like.off);
   for (const [name, text] of Object.entries(texts)) {
@@ -266,7 +268,7 @@ async function checkAll() {
       found = undefined;
       rules.checkTook = performance.now() - rules.changedAt;
       say(String(error.message ?? error), true);
-      showProblem(String(error.message ?? error));
+      $("problems").replaceChildren(make("div", { class: "problem" }, make("pre", {}, String(error.message ?? error))));
     }
   }
   return found;
@@ -345,10 +347,6 @@ function continueUnder(engine) {
   const lost = engine.restore(before);
   refresh();
   return lost;
-}
-
-function showProblem(text) {
-  $("problems").replaceChildren(make("div", { class: "problem" }, make("pre", {}, text)));
 }
 
 /** Shows a place of a file in the editor. */

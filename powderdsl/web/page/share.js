@@ -12,11 +12,7 @@ const MAX_FROM = 16; // earlier links that one names
 const MAX_TEXT = 1 << 20; // characters of all files
 const FILE = /^[A-Za-z0-9_][A-Za-z0-9_-]{0,60}\.ya?ml$/;
 
-/**
- * @typedef {{key: string, files: Record<string, string | null> | null, off: string[],
- *   parameters: Record<string, number>, from?: string[], world: import("./engine.js").Snapshot}} Shared
- * `from` names the links that this work came from, the last one first.
- */
+/** `from` names the links that this work came from, the last one first. @typedef {ReturnType<typeof checked>} Shared */
 
 async function squeezed(data, stream) {
   return new Uint8Array(await new Response(new Blob([data]).stream().pipeThrough(stream)).arrayBuffer());

@@ -3,28 +3,22 @@
 import { get } from "./dom.js";
 import { app } from "./state.js";
 
-const modules = new Map();
+const known = new Map();
 
+/** What a file of the site holds, read once. */
+function once(path, read) {
+  if (!known.has(path)) {
+    const found = get(path).then(read);
+    found.catch(() => known.delete(path));
+    known.set(path, found);
+  }
+  return known.get(path);
+}
+
+const readModule = async (answer) => WebAssembly.compile(await answer.arrayBuffer());
 /** The site's module of its own rules. */
-export function shippedModule(key, rows, columns) {
-  const path = `rules/${key}-${rows}x${columns}.wasm`;
-  if (!modules.has(path)) {
-    const found = get(path).then(async (answer) => WebAssembly.compile(await answer.arrayBuffer()));
-    found.catch(() => modules.delete(path));
-    modules.set(path, found);
-  }
-  return modules.get(path);
-}
-
-const sheets = new Map();
-export function sheetOf(key) {
-  if (!sheets.has(key)) {
-    const found = get(`rules/${key}.json`).then((answer) => answer.json());
-    found.catch(() => sheets.delete(key));
-    sheets.set(key, found);
-  }
-  return sheets.get(key);
-}
+export const shippedModule = (key, rows, columns) => once(`rules/${key}-${rows}x${columns}.wasm`, readModule);
+export const sheetOf = (key) => once(`rules/${key}.json`, (answer) => answer.json());
 
 /** The row of the catalog about some rules; undefined if the site lacks them. */
 export const listedRules = (key) => app.catalog.rules.find((one) => one.key === key);

@@ -8,19 +8,16 @@ export const app = {
   /** @type {Engine} */ engine: null,
   /** @type {Painter} */ painter: null,
   /** The color of each element, by id. @type {Map<number, string>} */ colors: null,
-  /** Moments before and after changes: `work.js` fills it. */
   history: new History(),
   /** The world that `reset` returns to. @type {import("./engine.js").Snapshot} */ start: null,
   /** The world's name in its menu, "" for one from elsewhere, and the seed; both as they are used. */
   named: { world: "", seed: "0" },
   /** Whether the world is other than its start and the rules have made it. */
   painted: false,
-  /** The number of what has been opened, and its name among what the browser keeps. */
-  sitting: 0,
-  work: "",
+  /** The number of what has been opened, */ sitting: 0,
+  /** and its name among what the browser keeps. */ work: "",
   /** The swap of the engine that is under way. @type {Promise<any> | null} */ swapping: null,
-  /** Whether something has changed that the browser does not keep yet. */
-  unsaved: false,
+  /** Whether something has changed that the browser does not keep yet. */ unsaved: false,
   running: false,
   speed: 60,
   tool: "brush",

@@ -12,6 +12,9 @@ const MOST = 12; // pieces of work,
 const ROOM = 128 * 2 ** 20; // and bytes of them all
 const RUNS = 10_000; // ms between two saves of a world that runs
 
+/** What the address asks for: rules, or the world of a link. */
+const place = () => location.search + location.hash;
+
 let base = null;
 let saved = { step: 0n, at: 0 };
 const channel = globalThis.BroadcastChannel && new BroadcastChannel("powderdsl");
@@ -34,7 +37,7 @@ function give(error) {
 function save(open = true) {
   const { sheet, edits, module, ...rest } = moment();
   const { files = null, off = sheet.off, good, shown } = edits ?? {};
-  const bytes = rest.compiled ? bytesOf.get(module) : undefined;
+  const bytes = bytesOf.get(module);
   const body = { ...rest, key: sheet.key, sheet: { ...sheet, worlds: [] }, files, off, good, shown, bytes };
   const { brush, element, running, speed, tool, work: id } = app;
   const settings = { blind: $("blind").checked, dark: $("dark").checked, tint: $("tint").checked, brush: { ...brush }, element, running, speed, tool };
@@ -43,11 +46,11 @@ function save(open = true) {
   const { rows, columns, fields, clock } = rest.world;
   const size = 2 * [...fields.values()].reduce((sum, { values }) => sum + values.byteLength, rows * columns) + (bytes?.length ?? 0);
   const [first, about] = [app.catalog.rules[0].key, `${rows}×${columns}, step ${clock[2]}`];
-  const head = { id, when: Date.now(), title, about, size, open, first, isWork: isWork(), hash: location.hash, settings, picture: picture() };
+  const head = { id, when: Date.now(), title, about, size, open, first, isWork: isWork(), place: place(), settings, picture: picture() };
   const change = write((heads, works) => [works.put(body, id), heads.put(head)]);
   change.onabort = () => give(change.error);
   change.commit(); // at once: a page that is left hears no answers
-  if (open) prune(id);
+  if (sessionStorage.getItem("work") !== id) prune(id);
   app.unsaved = false;
   saved = { step: clock[2], at: performance.now() };
   sessionStorage.setItem("work", id);
@@ -73,8 +76,11 @@ const prune = (id) =>
   });
 
 function picture() {
+  const { columns, rows } = app.engine;
+  const whole = make("canvas", { width: columns, height: rows });
+  whole.getContext("2d").putImageData(app.painter.draw($("tint").checked), 0, 0);
   const context = make("canvas", { width: 48, height: 48 }).getContext("2d");
-  context.drawImage($("canvas"), 0, 0, 48, 48);
+  context.drawImage(whole, 0, 0, 48, 48);
   return context.getImageData(0, 0, 48, 48);
 }
 
@@ -96,9 +102,9 @@ export async function restore() {
   base = await answer(asked);
   app.save = save;
   const heads = (await answer(read("heads").getAll())).sort((a, b) => b.when - a.when);
-  let head = heads.find((one) => one.id === sessionStorage.getItem("work") && one.hash === location.hash);
+  let head = heads.find((one) => one.id === sessionStorage.getItem("work") && one.place === place());
   const words = `Your work of ${time(head ?? heads[0])} is back.`;
-  if (!head && !location.hash && heads[0]?.isWork && !heads[0].open && heads[0].first === app.catalog.rules[0].key) {
+  if (!head && !place() && heads[0]?.isWork && !heads[0].open && heads[0].first === app.catalog.rules[0].key) {
     const { key, sheet } = await answer(read("works").get(heads[0].id));
     // Rules that have changed on the disk are to be seen: earlier work on them is in the list.
     if (JSON.stringify((await sheetOf(key)).files) === JSON.stringify(sheet.files)) [head] = heads;
@@ -148,7 +154,8 @@ setInterval(() => {
   const runs = app.engine.clock()[2] !== saved.step && performance.now() - saved.at > RUNS;
   if (app.unsaved || runs) now();
 }, 1000);
-addEventListener("pagehide", () => now(false));
+// The first gives a busy disk more time; not all browsers send it.
+for (const name of ["beforeunload", "pagehide"]) addEventListener(name, () => now(false));
 addEventListener("pageshow", ({ persisted }) => persisted && now());
 addEventListener("popstate", ({ state }) => {
   if (state?.work && state.work !== app.work && base) openKept({ id: state.work }, { words: "This is your earlier work, paused." }).catch(failed);

@@ -36,10 +36,9 @@ function apply(from, to, erases = false) {
 
 /** The number nearest to a value that such an array holds: it would wrap. */
 function held(type, value) {
-  if (type === Float32Array) return value;
-  const bits = 8 * type.BYTES_PER_ELEMENT;
-  const low = new type([-1])[0] < 0 ? -(2 ** (bits - 1)) : 0;
-  return Math.min(Math.max(Math.round(value), low), low + 2 ** bits - 1);
+  const count = 2 ** (8 * type.BYTES_PER_ELEMENT);
+  const low = new type([-1])[0] < 0 ? -count / 2 : 0;
+  return type === Float32Array ? value : Math.min(Math.max(Math.round(value), low), low + count - 1);
 }
 
 function setChosenField() {

@@ -8,12 +8,9 @@ import { refresh, use } from "./stage.js";
 import { app } from "./state.js";
 
 /**
- * `sitting` numbers what has been opened: moments of one sitting have the same rules, as edited since. `work` is its name
- * in the browser's storage. `edits` are the files of the editor; `texts`, those that a change of files alone replaces.
- * @typedef {{sitting: number, work: string, sheet: any, module: WebAssembly.Module, compiled: boolean, edits: any,
- *   parameters: Record<string, number>, world: Snapshot, start: Snapshot, named: {world: string, seed: string},
- *   painted: boolean, texts?: Record<string, string | undefined>}} Moment
- * @typedef {import("./engine.js").Snapshot} Snapshot
+ * What `moment` makes. Moments of one `sitting` have the same rules, as edited since; `work` is a name in the browser's
+ * storage. `texts` are the files that change, where nothing else does: those are exchanged alone.
+ * @typedef {ReturnType<typeof moment> & {texts?: Record<string, string | undefined>}} Moment
  */
 
 let newest = 0;
@@ -35,8 +32,7 @@ export function swap(prepare) {
       if (mine === newest) throw error;
       return false;
     } finally {
-      if (mine === newest) app.swapping = null;
-      if (mine === newest) showMenus();
+      if (mine === newest) [(app.swapping = null), showMenus()];
     }
   };
   const landed = run();
@@ -73,7 +69,6 @@ function setParameters(engine, values) {
   });
 }
 
-/** @returns {Moment} the present one */
 export function moment() {
   const { compiled, engine, named, painted, sitting, start, work } = app;
   const edits = app.edits ? app.edits.moment() : app.opened;
