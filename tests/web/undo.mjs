@@ -62,6 +62,7 @@ for (const seed of ["-1", "99999999999", "9223372036854775807", "922337203685477
 
 // A value that a field's numbers cannot hold is cut, not wrapped.
 await choose("rules", "powderworld");
+await page.locator("#run").click();
 await page.locator("[data-tool=field]").click();
 const fields = await page.evaluate(() => powderdsl.engine.fields.map((one) => `${one.name} ${one.type}`));
 await page.locator("#field").selectOption(String(fields.findIndex((one) => / int8/.test(one))));
