@@ -112,7 +112,7 @@ class Diagnostic:
 
     @property
     def fix(self) -> tuple[Span, str] | None:
-        """What to write at the place of a misspelled word, if the help names one word."""
+        """The place of a misspelled word and the word that the help names, if it names one."""
         words = [match[1] for text in self.helps if (match := MEANT.fullmatch(text))]
         span = self.primary.span
         return (span, words[0]) if span is not None and len(words) == 1 and span.text.strip() else None

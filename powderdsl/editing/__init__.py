@@ -1,1 +1,1 @@
-"""What editors show of files: completion, hover texts, places of names, fixes, and one layout."""
+"""Completion, hover texts, places of names, and one layout of files, for editors."""

@@ -1,4 +1,4 @@
-"""Where a cursor stands in a file: below which keys, in a key or in a value, and in which word."""
+"""A cursor in a file: the keys above it, the key whose value it is in, and its word."""
 
 from __future__ import annotations
 
@@ -143,7 +143,7 @@ def _below(part: dict[str, Any], key: str) -> Iterator[dict[str, Any]]:
 
 
 def keys_at(path: tuple[str, ...], kind: str) -> dict[str, str]:
-    """The keys that may stand below some keys, and what each means."""
+    """The keys that may stand below some keys, with their meanings."""
     keys: dict[str, str] = {}
     for part in parts_at(path, kind):
         keys |= {key: value.get("description", "") for key, value in part.get("properties", {}).items()}

@@ -94,7 +94,7 @@ def _moved(line: str, shift: int) -> str:
 
 
 def _said(node: Node | None) -> object:
-    """What a file says, without its layout."""
+    """The content of a file, without its layout."""
     if isinstance(node, Mapping):
         return [(key.text, _said(value)) for key, value in node.entries]
     if isinstance(node, Scalar) or node is None:

@@ -46,7 +46,7 @@ class Symbol:
 
 @dataclass
 class Rules:
-    """What was last read for a file: its packs, and the model of the last text without mistakes."""
+    """The packs last read for a file, and the model of the last text without mistakes."""
 
     packs: list[PackDecl] = field(default_factory=list)
     model: Ruleset | None = None
@@ -89,7 +89,7 @@ class Workspace:
     # Mistakes
 
     def check(self, path: Path) -> tuple[Diagnostic, ...]:
-        """What `powderdsl check --quick --notes` says of a file, in all files that it needs.
+        """The diagnostics of `powderdsl check --quick --notes` for a file, in all files that it needs.
 
         Nothing of other YAML files, which have none of our first keys.
         """
@@ -151,7 +151,7 @@ class Workspace:
         ]
 
     def hover(self, path: Path, offset: int) -> tuple[str, Span] | None:
-        """What the word at a place means, as Markdown, and its place."""
+        """The meaning of the word at a place, as Markdown, and its place."""
         text = self.text(path)
         cursor = cursor_at(text, offset)
         if not cursor.word:
@@ -166,16 +166,16 @@ class Workspace:
         return ("\n\n".join(parts), span) if parts else None
 
     def definition(self, path: Path, offset: int) -> list[Span]:
-        """Where the word at a place is defined."""
+        """The definitions of the word at a place."""
         cursor = cursor_at(self.text(path), offset)
-        found = [word.span for word in self._rules(path).words.get(cursor.word, ()) if word.span is not None]
-        if found:
-            return found
+        places = [word.span for word in self._rules(path).words.get(cursor.word, ()) if word.span is not None]
+        if places:
+            return places
         packs = {pack.name.text: pack.name.span for pack in self._rules(path).packs}
         return [packs[cursor.word]] if cursor.word in packs else []
 
     def references(self, path: Path, offset: int) -> list[Span]:
-        """Where the name at a place occurs, in all files that are loaded with this one."""
+        """The places of the name at a place, in all files that are loaded with this one."""
         cursor, rules = cursor_at(self.text(path), offset), self._rules(path)
         if not any(entry.span is not None for entry in rules.words.get(cursor.word, ())):
             return []
@@ -211,7 +211,7 @@ class Workspace:
 
 
 def _namespace(cursor: Cursor) -> str:
-    """What a word at a place names: a pack or a pass, which have names of their own, or anything else."""
+    """The namespace of a word at a place: that of packs, of passes, or of all other names."""
     if cursor.key in PACKS or cursor.keys in (("pack",), ("ruleset",)):
         return "pack"
     is_pass = (cursor.path == ("passes",) and cursor.key is None) or cursor.key in ("after", "before")
@@ -236,7 +236,8 @@ def _described(word: Word, model: Ruleset | None) -> str:
     """A word as Markdown: what it is, where it comes from, and its values."""
     title = f"**{word.kind}** `{word.name}`" + (f" of pack `{word.pack}`" if word.pack else "")
     lines = [title + (f": {word.about}" if word.about else "")]
-    element = next((one for one in model.elements if one.name == word.name), None) if model else None
+    elements = model.elements if model else ()
+    element = next((element for element in elements if element.name == word.name), None)
     if element is not None and word.kind == "element":
         lines.append(f"id {element.id}, color {element.color}")
     return "\n\n".join(lines)
