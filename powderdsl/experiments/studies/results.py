@@ -6,6 +6,7 @@ import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -198,25 +199,40 @@ class Panel:
     scale: str = "linear"
     ticks: Sequence[str] = ()
     baselines: Mapping[str, float] = field(default_factory=dict)
+    title: str = ""
 
 
 def write_figure(path: Path, study: Study, size: str, outcomes: Sequence[Outcome]) -> None:
-    """Draw each measure along the first setting, a line for each combination of the others. Raises as `draw`."""
-    first, panels, seeds = study.axes[0], [], 0
+    """Draw each measure along the first setting, a line for each combination of the others. Raises as `draw`.
+
+    If several others vary, each value of the one with the most values has a row of panels.
+    """
+    first, rows, seeds = study.axes[0], [], 0
     ticks = [word.text for word in first.values[size]]
-    for finding in findings(study, outcomes):
-        lines = []
-        for label, cells in _lines(finding.cells).items():
-            samples = [[*cell.by_seed.values()] for cell in cells]
-            lines.append(Line(label, [ticks.index(cell.values[first.name]) for cell in cells], samples))
-            seeds = max(seeds, *map(len, samples))
-        panels.append(Panel(first.about, finding.measure.about, lines, finding.measure.scale, ticks))
+    measured = findings(study, outcomes)
+    values: dict[str, dict[str, None]] = {axis.name: {} for axis in study.axes[1:]}
+    for cell in (cell for finding in measured for cell in finding.cells):
+        for name, seen in values.items():
+            seen[cell.values[name]] = None
+    varied = [name for name, seen in values.items() if len(seen) > 1]
+    split = max(varied, key=lambda name: len(values[name])) if len(varied) > 1 else None
+    for value in values[split] if split else [None]:
+        panels = []
+        for finding in measured:
+            lines, own = [], [cell for cell in finding.cells if split is None or cell.values[split] == value]
+            for label, cells in _lines(own).items():
+                samples = [[*cell.by_seed.values()] for cell in cells]
+                lines.append(Line(label, [ticks.index(cell.values[first.name]) for cell in cells], samples))
+                seeds = max(seeds, *map(len, samples))
+            measure = finding.measure
+            panels.append(Panel(first.about, measure.about, lines, measure.scale, ticks, title=value or ""))
+        rows.append(panels)
     if seeds:
-        draw(path, panels, f"{study.about} ({size}, {seeds} seeds)")
+        draw(path, rows, f"{study.name} ({size}, {seeds} seeds)")
 
 
-def draw(path: Path, panels: Sequence[Panel], title: str, *, follow: bool = False) -> None:
-    """Draw panels side by side, with all samples as dots. The suffix of the path says which format is written.
+def draw(path: Path, rows: Sequence[Sequence[Panel]], title: str, *, follow: bool = False) -> None:
+    """Draw rows of panels, with all samples as dots. The suffix of the path says which format is written.
 
     `follow`: write to where a link leads. Raises CompileError: PD612 without matplotlib, PD613 if the file cannot be
     written.
@@ -224,8 +240,11 @@ def draw(path: Path, panels: Sequence[Panel], title: str, *, follow: bool = Fals
     require("matplotlib", "drawing a plot", "pip install 'powderdsl[plot]'")
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(max(5.5 * len(panels), 6.5), 4.2), layout="constrained")
-    for axes, panel in zip(figure.subplots(1, len(panels), squeeze=False)[0], panels, strict=True):
+    columns = len(rows[0])
+    height = 4.2 if len(rows) == 1 else 3 * len(rows)
+    figure = Figure(figsize=(max(5.5 * columns, 6.5), height), layout="constrained")
+    parts = figure.subplots(len(rows), columns, squeeze=False).flat
+    for axes, panel in zip(parts, chain.from_iterable(rows), strict=True):
         for line in panel.lines:
             intervals = [interval(samples, panel.scale) for samples in line.samples]
             means = [interval.mean for interval in intervals]
@@ -245,6 +264,7 @@ def draw(path: Path, panels: Sequence[Panel], title: str, *, follow: bool = Fals
         axes.set_yscale(panel.scale)
         axes.set_xlabel(panel.across)
         axes.set_ylabel(panel.up)
+        axes.set_title(panel.title, fontsize=10)
         axes.grid(linewidth=0.3)
         if axes.get_legend_handles_labels()[1]:
             axes.legend(fontsize=8)
@@ -314,4 +334,4 @@ def write_curves(
     across = "interactions" if metric.startswith(("held_out/", "rollout/")) else "steps"
     positive = all(min(samples) > 0 for curve in curves for samples in curve.samples)
     scale = "log" if metric.startswith("loss") and positive else "linear"
-    draw(path, [Panel(across, metric, curves, scale, baselines=baselines)], title, follow=True)
+    draw(path, [[Panel(across, metric, curves, scale, baselines=baselines)]], title, follow=True)
