@@ -49,6 +49,7 @@ def server(beside: str = "") -> Any:
     served = LanguageServer("powderdsl", version())
     files = Workspace(beside, commands)
     ended: list[bool] = []
+    mistakes: dict[Path, tuple[Diagnostic, ...]] = {}
     shown: dict[Path, tuple[str, ...]] = {}
     levels = {
         Severity.ERROR: lsp.DiagnosticSeverity.Error,
@@ -112,7 +113,8 @@ def server(beside: str = "") -> Any:
         """Publish the mistakes of a file, in every file that they are in."""
         own = str(from_fs_path(str(path)))
         by_file: dict[str, list[lsp.Diagnostic]] = {own: []}
-        for diagnostic in files.check(path):
+        mistakes[path] = files.check(path)
+        for diagnostic in mistakes[path]:
             span = diagnostic.primary.span
             by_file.setdefault(own if span is None else uri_of(span), []).append(as_lsp(diagnostic))
         for uri in dict.fromkeys([*shown.get(path, ()), *by_file]):
@@ -130,6 +132,7 @@ def server(beside: str = "") -> Any:
     def closed(params: lsp.DidCloseTextDocumentParams) -> None:
         path = path_of(params.text_document)
         files.close(path)
+        mistakes.pop(path, None)
         for uri in shown.pop(path, ()):
             served.text_document_publish_diagnostics(lsp.PublishDiagnosticsParams(uri, []))
 
@@ -190,7 +193,7 @@ def server(beside: str = "") -> Any:
         path = path_of(params.text_document)
         here = params.range
         actions = []
-        for diagnostic in files.check(path):
+        for diagnostic in mistakes.get(path, ()):
             if diagnostic.fix is None:
                 continue
             span, text = diagnostic.fix
