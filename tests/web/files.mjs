@@ -26,8 +26,15 @@ await said("problems", /No mistakes/);
 await drop([["red.yaml", own("red")], ["blue.yaml", own("blue")]]);
 await element("red");
 await element("blue");
+// The new rules may run before the message is read, so all messages are kept.
+await page.evaluate(() => {
+  const status = document.getElementById("status");
+  window.messages = [];
+  new MutationObserver(() => window.messages.push(status.textContent)).observe(status, { childList: true });
+});
 await drop([["red.yaml", own("red", "# other\n")]]);
-seen.replaced = [await text("status"), await page.evaluate(() => powderdsl.edits.files["red.yaml"].includes("other"))];
+await page.waitForFunction(() => window.messages.some((one) => one.includes("replaced")));
+seen.replaced = [await page.evaluate(() => window.messages.find((one) => one.includes("replaced"))), await page.evaluate(() => powderdsl.edits.files["red.yaml"].includes("other"))];
 await undo();
 seen.replaced.push(await page.evaluate(() => powderdsl.edits.files["red.yaml"].includes("other")));
 
