@@ -107,6 +107,7 @@ class Workspace:
                 case "study":
                     from powderdsl.experiments.studies.study import load_study
 
+                    names = []  # a study loads no rules
                     load_study(str(path), self.commands())
                     return ()
                 case "scene" | "scenes":
@@ -119,7 +120,7 @@ class Workspace:
                     known.model, remarks = load_with_diagnostics(*names)
         except CompileError as error:
             remarks = error.diagnostics
-        packs = read(names, Reporter())[0] if self.kind(path) != "study" else []
+        packs = read(names, Reporter())[0]
         if packs:
             known.packs, known.words = packs, {}
             for word in (*self._language, *definitions(packs)):

@@ -14,7 +14,7 @@ MAX_BYTES = 4 * MAX_CHARACTERS
 
 
 OPEN: dict[Path, str] = {}
-"""Texts in an editor, by resolved path: read instead of their files."""
+"""Texts that are not saved yet, by resolved path: read instead of their files."""
 
 
 def read_source(path: Path, reporter: Reporter, *, limit: int = MAX_BYTES) -> Source | None:
@@ -23,7 +23,9 @@ def read_source(path: Path, reporter: Reporter, *, limit: int = MAX_BYTES) -> So
     `limit`: bytes that it may have.
     """
     try:
-        text = (OPEN and OPEN.get(path.resolve())) or read_bytes(path, limit).decode("utf-8-sig")
+        text = OPEN.get(path.resolve()) if OPEN else None
+        if text is None:
+            text = read_bytes(path, limit).decode("utf-8-sig")
     except UnicodeDecodeError as error:
         reporter.error(
             "PD101", f"`{path}` is not UTF-8 text", None, notes=[f"byte {error.start} cannot be decoded"]

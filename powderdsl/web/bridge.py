@@ -216,8 +216,8 @@ class Session:
             rules = set_params(rules, changed, reporter)
             reporter.raise_if_errors()
             sim = Simulator(rules, "wasm", tensors=False, memo=self.memo)
-        found = trace(self._world(world, sim), int(row), int(column), 1)
-        return {"text": trace_text(found), "data": trace_data(found)}
+        traced = trace(self._world(world, sim), int(row), int(column), 1)
+        return {"text": trace_text(traced), "data": trace_data(traced)}
 
     def save(self, world: dict[str, Any]) -> bytes:
         """A world as an .npz, which `powderdsl run` continues."""

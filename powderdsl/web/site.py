@@ -13,9 +13,7 @@ import io
 import json
 import re
 import shutil
-import struct
 import zipfile
-import zlib
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
@@ -208,20 +206,15 @@ def _sheet(entry: Entry) -> dict[str, Any]:
 
 def _picture(sheet: Mapping[str, Any], ruleset: Ruleset) -> bytes:
     """A PNG of the world that shows the rules best."""
+    from PIL import Image
+
     world = next(world for world in sheet["worlds"] if world["name"] == sheet["shown"])
     rows, columns, ids = world["rows"], world["columns"], base64.b64decode(world["ids"])
-    lines = b"".join(b"\0" + ids[start : start + columns] for start in range(0, rows * columns, columns))
     colors = {element.id: element.color for element in ruleset.elements}
-    chunks = {
-        b"IHDR": struct.pack(">IIBBBBB", columns, rows, 8, 3, 0, 0, 0),
-        b"PLTE": bytes.fromhex("".join(colors.get(id, "#000000")[1:] for id in range(256))),
-        b"IDAT": zlib.compress(lines, 9),
-        b"IEND": b"",
-    }
-    words = [(len(data), kind + data, zlib.crc32(kind + data)) for kind, data in chunks.items()]
-    return b"\x89PNG\r\n\x1a\n" + b"".join(
-        struct.pack(">I", length) + text + struct.pack(">I", check) for length, text, check in words
-    )
+    image = Image.frombytes("P", (columns, rows), ids)
+    image.putpalette(bytes.fromhex("".join(colors.get(id, "#000000")[1:] for id in range(256))))
+    image.save(file := io.BytesIO(), "PNG", optimize=True)
+    return file.getvalue()
 
 
 class Site:

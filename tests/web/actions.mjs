@@ -1,5 +1,5 @@
 // Random actions over every control, and reloads that must lose nothing: node actions.mjs ADDRESS [COUNT [SEED]]
-import { launch, openPage, tools } from "./browser.mjs";
+import { launch, linkToLife, openPage, tools } from "./browser.mjs";
 
 const [address, number = "500", seed = "1"] = process.argv.slice(2);
 const count = Number(number);
@@ -107,14 +107,7 @@ function prepare() {
   };
 }
 
-const other = await openPage(browser, address);
-await other.page.waitForFunction(() => powderdsl.linkOpened, null, { timeout: 60000 });
-await other.page.locator("#rules").selectOption("life");
-await other.page.waitForFunction(() => powderdsl.rules.key === "life");
-await other.page.locator("#share").click();
-await other.page.waitForFunction(() => location.hash.length > 10);
-const link = await other.page.evaluate(() => location.hash);
-await other.page.close();
+const link = await linkToLife(browser, address);
 
 let state = Number(seed);
 const sitting = Math.max(100, Math.floor(count / 10));

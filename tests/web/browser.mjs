@@ -62,16 +62,7 @@ export function tools(page) {
     await page.locator(`#${id}`).selectOption(value);
     await settled();
   };
-  const edit = (from, to) =>
-    page.evaluate(
-      ([old, fresh]) => {
-        const { view } = powderdsl.edits.editor;
-        const at = view.state.doc.toString().indexOf(old);
-        if (at < 0) throw new Error(`${old} is not in the file`);
-        view.dispatch({ changes: { from: at, to: at + old.length, insert: fresh } });
-      },
-      [from, to],
-    );
+  const edit = (from, to) => replaceText(page, from, to);
   /** The compiler is there; it may take longer here than people want to wait, since other tests run. */
   const ready = async () => {
     await until(() => globalThis.powderdsl?.compilerReady && powderdsl.linkOpened && powderdsl.edits);
@@ -84,4 +75,30 @@ export function tools(page) {
     await page.mouse.click(box.x + box.width * x, box.y + box.height * y);
   }
   return { text, until, ready, said, settled, state, count, choose, edit, applied, files, paint };
+}
+
+/** Replaces a text in the editor. */
+export const replaceText = (page, from, to) =>
+  page.evaluate(
+    ([old, fresh]) => {
+      const { view } = powderdsl.edits.editor;
+      const at = view.state.doc.toString().indexOf(old);
+      if (at < 0) throw new Error(`${old} is not in the file`);
+      view.dispatch({ changes: { from: at, to: at + old.length, insert: fresh } });
+    },
+    [from, to],
+  );
+
+/** The hash of a link to a world of life, shared in a page of its own. */
+export async function linkToLife(browser, address, run = false) {
+  const { page } = await openPage(browser, address);
+  if (run) await page.locator("#run").click();
+  await page.waitForFunction(() => powderdsl.linkOpened, null, { timeout: 60000 });
+  await page.locator("#rules").selectOption("life");
+  await page.waitForFunction(() => powderdsl.rules.key === "life");
+  await page.locator("#share").click();
+  await page.waitForFunction(() => location.hash.length > 10);
+  const link = await page.evaluate(() => location.hash);
+  await page.close();
+  return link;
 }

@@ -1,7 +1,7 @@
 // Uses the playground as people do, in headless Chromium: node page.mjs ADDRESS FOLDER
 // Pictures and downloads go to FOLDER; what was seen is printed as JSON.
 import { join } from "node:path";
-import { launch, openPage } from "./browser.mjs";
+import { launch, openPage, replaceText as edit } from "./browser.mjs";
 
 const [address, folder] = process.argv.slice(2);
 const browser = await launch();
@@ -37,18 +37,6 @@ const said = (page, id, pattern) =>
     { timeout: 60000 },
   );
 
-/** Replaces a text in the editor. */
-async function edit(page, from, to) {
-  await page.evaluate(
-    ([old, fresh]) => {
-      const { view } = powderdsl.edits.editor;
-      const at = view.state.doc.toString().indexOf(old);
-      if (at < 0) throw new Error(`${old} is not in the file`);
-      view.dispatch({ changes: { from: at, to: at + old.length, insert: fresh } });
-    },
-    [from, to],
-  );
-}
 const until = (page, what) =>
   page.waitForFunction((name) => powderdsl.edits[name] !== null, what, { timeout: 60000 });
 

@@ -1,6 +1,6 @@
 // Work is kept: through reloads, links over it, in other tabs: node work.mjs ADDRESS FOLDER
 import { join } from "node:path";
-import { launch, openPage, tools } from "./browser.mjs";
+import { launch, linkToLife, openPage, tools } from "./browser.mjs";
 
 const [address, folder] = process.argv.slice(2);
 const browser = await launch();
@@ -47,15 +47,7 @@ await applied();
 await page.locator("#step").click();
 const before = await whole();
 const same = async () => (await whole()) === before;
-const other = await openPage(browser, address);
-await other.page.locator("#run").click();
-await other.page.waitForFunction(() => powderdsl.linkOpened, null, { timeout: 60000 });
-await other.page.locator("#rules").selectOption("life");
-await other.page.waitForFunction(() => powderdsl.rules.key === "life");
-await other.page.locator("#share").click();
-await other.page.waitForFunction(() => location.hash.length > 10);
-const link = await other.page.evaluate(() => location.hash);
-await other.page.close();
+const link = await linkToLife(browser, address, true);
 await page.evaluate((hash) => (location.hash = hash), link);
 await said("status", /world of the link/);
 seen.link = [await text("status"), (await state()).key];

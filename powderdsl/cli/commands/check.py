@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import sys
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,7 +19,7 @@ from powderdsl.compiler import load_with_diagnostics, lower
 from powderdsl.diagnostics import CompileError, Diagnostic, Severity
 from powderdsl.diagnostics.diagnostic import diagnostic_data
 from powderdsl.model.types import Ruleset
-from powderdsl.syntax.sources import shipped
+from powderdsl.syntax.sources import OPEN, shipped
 from powderdsl.system.cache import persistent
 from powderdsl.system.reports import table
 from powderdsl.system.writing import write_text
@@ -82,9 +83,10 @@ def command(
 
     Exit code: 0 without errors, 1 with warnings under --warnings-as-errors, 2 with errors.
     """
-    results = [_check(name, None if quick else prove, cost, ledger) for name in rules]
-    for number, name in enumerate(rules) if fix else ():
-        while better := _corrected(results[number], name, prove if not quick else None, as_json):
+    checks = [partial(_check, name, None if quick else prove, cost, ledger) for name in rules]
+    results = [check() for check in checks]
+    for number, check in enumerate(checks) if fix else ():
+        while better := _corrected(results[number], check, as_json):
             results[number] = better
     # Compositions share packs: a dictionary has each diagnostic once.
     shown = dict.fromkeys(
@@ -160,31 +162,27 @@ def _check(name: str, prove: int | None, cost: bool, ledger: bool) -> Checked:
     return Checked(name, diagnostics, ruleset, expenses, _ledger(ruleset) if ledger else None, claims)
 
 
-def _corrected(result: Checked, name: str, prove: int | None, quiet: bool) -> Checked | None:
-    """Write what misspelled words mean; the new result, or None if it has no fewer errors and files are as before."""
+def _corrected(result: Checked, check: Callable[[], Checked], quiet: bool) -> Checked | None:
+    """Write what misspelled words mean; the new result, or None, and files as before, if it has no fewer errors."""
     wrong = [diagnostic for diagnostic in result.diagnostics if diagnostic.fix]
-    wrong = [
-        diagnostic for diagnostic in wrong if diagnostic.code == "PD108"
-    ] or wrong  # names depend on keys
-    fixes = dict(diagnostic.fix for diagnostic in wrong if diagnostic.fix)
+    keys = [diagnostic for diagnostic in wrong if diagnostic.code == "PD108"]  # names depend on keys
+    fixes = dict(diagnostic.fix for diagnostic in keys or wrong if diagnostic.fix)
     ours = shipped("rules").parent.resolve()
     texts: dict[Path, str] = {}
     for span in sorted(fixes, key=lambda span: -span.start):
-        path = Path(span.source.name)
-        if ours in path.resolve().parents:
-            continue
-        text = texts.setdefault(path, span.source.text)
-        texts[path] = text[: span.start] + fixes[span] + text[span.end :]
-    before = {path: path.read_bytes() for path in texts}
+        path = Path(span.source.name).resolve()
+        if ours not in path.parents:
+            text = texts.get(path, span.source.text)
+            texts[path] = text[: span.start] + fixes[span] + text[span.end :]
+    OPEN.update(texts)
+    better = check() if texts else result
+    OPEN.clear()
+    if better.number(Severity.ERROR) >= result.number(Severity.ERROR):
+        return None
     for path, text in texts.items():
         write_text(path, text)
-    better = _check(name, prove, cost=False, ledger=False) if texts else result
-    if better.number(Severity.ERROR) >= result.number(Severity.ERROR):
-        for path, data in before.items():
-            path.write_bytes(data)
-        return None
     for span, word in fixes.items() if not quiet else ():
-        if Path(span.source.name) in texts:
+        if Path(span.source.name).resolve() in texts:
             click.echo(f"fixed {span.place}: `{span.text}` is now `{word}`")
     return better
 
