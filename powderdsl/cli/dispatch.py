@@ -34,7 +34,7 @@ GROUPS = {
         "universe": "Print the rule pack of a seed: invented elements and laws.",
         "fmt": "Give YAML files one layout, comments included.",
         "schema": "Print the JSON Schema of all files, for editors.",
-        "lsp": "Serve editors: the Language Server Protocol, over the standard streams.",
+        "lsp": "Run a language server for editors.",
         "explain": "Explain a diagnostic code and how to fix it.",
         "compile": "Print the output of a compiler stage.",
         "bench": "Measure how fast rules run, on each backend, batch and size.",

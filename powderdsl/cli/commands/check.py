@@ -54,7 +54,7 @@ class Checked:
 @click.command("check")
 @click.argument("rules", nargs=-1, required=True, metavar="RULES...")
 @opt.option("--json", bool, "One JSON list instead of text.", to="as_json")
-@opt.option("--fix", bool, "Write the words that misspelled ones mean, if that leaves fewer errors.")
+@opt.option("--fix", bool, "Correct misspelled words, if that leaves fewer errors.")
 @opt.option("--notes", bool, "Also list notes, such as inactive rules.")
 @opt.option("--warnings-as-errors", bool, "Exit with 1 if there are warnings.")
 @opt.option("--quick", bool, "Check only the rules themselves; do not judge invariants.")
@@ -163,7 +163,7 @@ def _check(name: str, prove: int | None, cost: bool, ledger: bool) -> Checked:
 
 
 def _corrected(result: Checked, check: Callable[[], Checked], quiet: bool) -> Checked | None:
-    """Write what misspelled words mean; the new result, or None, and files as before, if it has no fewer errors."""
+    """Correct misspelled words; return the new result, or None, with files as before, if it has no fewer errors."""
     wrong = [diagnostic for diagnostic in result.diagnostics if diagnostic.fix]
     keys = [diagnostic for diagnostic in wrong if diagnostic.code == "PD108"]  # names depend on keys
     fixes = dict(diagnostic.fix for diagnostic in keys or wrong if diagnostic.fix)

@@ -21,10 +21,10 @@ if TYPE_CHECKING:
 @click.command("lsp")
 @opt.option("--with", str, "Rules that packs are checked with, besides those they need.", "", to="beside")
 def command(beside: str) -> None:
-    """Serve editors: the Language Server Protocol, over stdin and stdout.
+    """Run a language server for editors, over stdin and stdout.
 
-    Mistakes while you type, completion, what a word means, where it is defined and used, rename, fixes and outline, in
-    packs, rulesets, tasks, scenes and studies. Editors start this command: see docs/editors.md.
+    It reports mistakes while you type, completes and explains words, finds definitions and uses, renames, fixes,
+    formats and outlines packs, rulesets, tasks, scenes and studies. Editors start this command: see docs/editors.md.
     """
     require("pygls", "lsp")
     assert sys.__stdin__ is not None
