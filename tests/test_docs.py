@@ -2,19 +2,22 @@
 
 Fenced blocks are run page by page, in order, in one temporary directory:
 
-* ``yaml``: a pack or ruleset. A block without ``pack:`` is part of a pack called `example`. Comments at its
-  top say what it is loaded with (its `needs` otherwise) and what is expected: ``# with: core+sand``,
-  ``# error: PD301``, ``# warning: PD507``, ``# note: PD506``; ``# file: docs/examples/x.yaml`` demands that
-  it is all of that file but its invariants and tests. It is saved under its name for later blocks to load, and its
-  `tests:` are run.
-  One with ``task:`` is a task, which must have no mistakes; one with ``scene:`` is drawn with those rules.
+* ``yaml``: a whole pack or ruleset, so that readers can paste it. It is saved under its name for later blocks to load,
+  and its `tests:` are run. One with ``task:`` is a task, which must have no mistakes; one with ``scene:`` is drawn.
 * ``statements`` of a generator and ``rewards``, one a line, with the names of `TASK`.
 * ``rules``: one rule a line, each loaded in a pass of its own. ``expressions``: one value a line.
-* ``python``: one namespace a page. A line ``VALUE  # uint8 [8, 64, 64]`` is compared. With ``# file: nets.py`` at its
-  top, it is saved under that name for later blocks. One with ``# needs: MODULE`` is left out where an optional dependency
-  is not installed, and the page is then reported as skipped.
+* ``python``: one namespace a page. A line ``VALUE  # uint8 [8, 64, 64]`` is compared.
 * ``console``: what follows ``$ powderdsl`` is run; other lines must occur in what it prints. The exit code
   is 0, or 2 where the block shows an error.
+
+Readers do not see the notes of a block, which stand in an HTML comment on the line above it:
+
+* ``<!-- with: core+sand -->``: the rules that it is loaded with; otherwise the pack's `needs`.
+* ``<!-- error: PD301; warning: PD507; note: PD506 -->``: the diagnostics that it must have.
+* ``<!-- file: docs/examples/x.yaml -->`` above a pack: it is all of that file but its invariants and tests. Above Python:
+  it is saved under that name for later blocks.
+* ``<!-- needs: MODULE -->`` above Python: it is left out where that module is not installed, and the page is then
+  reported as skipped.
 """
 
 from __future__ import annotations
@@ -54,17 +57,17 @@ MANY_STEPS = 4
 
 @dataclass(frozen=True)
 class Block:
-    """A fenced block of a page: its language, its text, and the line it starts at."""
+    """A fenced block of a page: its language, its text, the line it starts at, and the comment above it."""
 
     language: str
     text: str
     line: int
+    comment: str = ""
 
     def expected(self, word: str) -> str:
-        """The value of a `# word: value` comment at the top of the block."""
-        head = re.match(r"(#.*\n)*", self.text)
-        found = re.search(rf"^# {word}: (.*)$", head[0] if head else "", re.MULTILINE)
-        return found[1].strip() if found else ""
+        """The value of `word: value` in the comment above the block."""
+        notes = dict(note.split(": ", 1) for note in self.comment.split("; ") if note)
+        return notes.get(word, "")
 
 
 RUNNABLE = ("yaml", "rules", "expressions", "statements", "rewards", "python", "console")
@@ -78,11 +81,14 @@ regions: {pit: box rows 50:63, slot: box columns 54:63}
 targets: {house: [fill wood in pit]}
 agent: {may: [any, blow], speed: 20, actions: 64}
 """
-FENCED = re.compile(r"^```(\w*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+FENCED = re.compile(r"(?:^<!-- (\w+: [^\n]*) -->\n)?^```(\w*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 
 
 def blocks_of(page: str) -> list[Block]:
-    return [Block(one[1], one[2], page[: one.start()].count("\n") + 1) for one in FENCED.finditer(page)]
+    return [
+        Block(match[2], match[3], page[: match.start(3)].count("\n"), match[1] or "")
+        for match in FENCED.finditer(page)
+    ]
 
 
 def read(page: Path) -> str:
@@ -110,17 +116,11 @@ def run_yaml(block: Block) -> None:
         Path(f"{scene[1]}.yaml").write_text(text, encoding="utf-8")
         load_start(f"{scene[1]}.yaml", load(block.expected("with")))
         return
-    if not re.search(r"^(pack|ruleset):", text, re.MULTILINE):
-        given = load(block.expected("with")).packs if block.expected("with") else ()
-        needs = (
-            "" if not given or re.search("^needs:", text, re.MULTILINE) else f"needs: [{', '.join(given)}]\n"
-        )
-        text = f"pack: example\n{needs}{text}"
     name = re.search(r"^(?:pack|ruleset): *(\w+)", text, re.MULTILINE)
     assert name, "the block names no pack"
     if block.expected("file"):
         whole = (ROOT / block.expected("file")).read_text(encoding="utf-8")
-        assert text.partition("\n")[2] == re.split(r"^(?:invariants|tests):", whole, flags=re.MULTILINE)[0]
+        assert text == re.split(r"^(?:invariants|tests):", whole, flags=re.MULTILINE)[0]
     packs = block.expected("with")
     path = Path(f"{name[1]}.yaml")
     path.write_text(text, encoding="utf-8")
@@ -355,31 +355,32 @@ def test_every_table_of_keys_is_shown(generate: Any) -> None:
 
 
 @pytest.mark.parametrize(
-    ("language", "text"),
+    ("language", "text", "comment"),
     [
-        ("yaml", "# with: core\n# error: PD301\nelements: {salt: {id: 20, color: '#FFFFFF'}}\n"),
-        ("yaml", "# with: core\nparams: {unused: 5%}\n"),
-        ("rules", "# with: core\nwall -> empty\nwall -> salt\n"),
-        ("expressions", "# with: core\ncount(wall) > 1\ncount(wall) > wall\n"),
-        ("yaml", "# with: core\nscene: bad\nsize: [3, 3]\nfill: empty\ndraw: [fill wal]\n"),
-        ("statements", "fill wall\nfill wal\n"),
-        ("rewards", "count(wall)\ncount(wal)\n"),
-        ("console", "$ powderdsl explain PD999\n"),
-        ("console", "$ powderdsl --version\npowderdsl 77.0\n"),
-        ("python", "assert False\n"),
-        ("python", "import numpy\nnumpy.zeros(3)  # float32 [3]\n"),
-        ("yaml", "# file: docs/examples/salt.yaml\npack: salt\n"),
+        ("yaml", "pack: a\nneeds: [core]\nelements: {salt: {id: 20, color: '#FFFFFF'}}\n", "error: PD301"),
+        ("yaml", "pack: a\nneeds: [core]\nparams: {unused: 5%}\n", ""),
+        ("yaml", "elements: {salt: {id: 20, color: '#FFFFFF'}}\n", ""),
+        ("rules", "wall -> empty\nwall -> salt\n", "with: core"),
+        ("expressions", "count(wall) > 1\ncount(wall) > wall\n", "with: core"),
+        ("yaml", "scene: bad\nsize: [3, 3]\nfill: empty\ndraw: [fill wal]\n", "with: core"),
+        ("statements", "fill wall\nfill wal\n", ""),
+        ("rewards", "count(wall)\ncount(wal)\n", ""),
+        ("console", "$ powderdsl explain PD999\n", ""),
+        ("console", "$ powderdsl --version\npowderdsl 77.0\n", ""),
+        ("python", "assert False\n", ""),
+        ("python", "import numpy\nnumpy.zeros(3)  # float32 [3]\n", ""),
+        ("yaml", "pack: salt\n", "file: docs/examples/salt.yaml"),
     ],
 )
-def test_blocks_can_fail(language: str, text: str, folder: Path) -> None:
+def test_blocks_can_fail(language: str, text: str, comment: str, folder: Path) -> None:
     with pytest.raises((AssertionError, CompileError)):
-        run_block(Block(language, text, 1), {})
+        run_block(Block(language, text, 1, comment), {})
 
 
 def test_a_page_without_an_optional_dependency_is_skipped_visibly(folder: Path) -> None:
     page = folder / "page.md"
     page.write_text(
-        "```python\n# needs: no_such_module\nassert False\n```\n```python\n__import__('pathlib').Path('ran').touch()\n```\n"
+        "<!-- needs: no_such_module -->\n```python\nassert False\n```\n```python\n__import__('pathlib').Path('ran').touch()\n```\n"
     )
     with pytest.raises(pytest.skip.Exception, match="not installed: no_such_module"):
         run_page(page)
