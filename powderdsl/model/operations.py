@@ -1,7 +1,7 @@
 """Every operation of the language in one table, a row each.
 
 The words of functions, their arguments' kinds, the folding of constants, ranges of integers, the search of
-`logic.satisfy`, the printed model, the lowering, random rules and the table in `docs/language.md` follow from it. The
+`logic.satisfy`, the printed model, the lowering, random rules and the table in `docs/language/expressions.md` follow from it. The
 oracle, `model.reference`, has a table of its own.
 """
 
@@ -27,7 +27,7 @@ NUMBER, PLACE = Kind("number"), Kind("place")
 class Operation:
     """A row of `OPERATIONS`.
 
-    about: one sentence; of a function, as `docs/language.md` has it. `value` is what an `Expr` of it has besides its
+    about: one sentence; of a function, as `docs/language/expressions.md` has it. `value` is what an `Expr` of it has besides its
         arguments.
     usage: how rules call it; nothing for an operation that is written in another way.
     takes: the kinds of the arguments. Without them a function has a check of its own in `expressions.operators`.

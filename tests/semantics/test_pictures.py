@@ -57,7 +57,7 @@ passes:
 
 
 def ramped(ruleset: Ruleset, ids: np.ndarray, read) -> np.ndarray:  # type: ignore[no-untyped-def]
-    """Pictures uint8 [..., 3]: what docs/language.md says, word by word."""
+    """Pictures uint8 [..., 3]: what docs/language/elements.md says, word by word."""
     picture = np.zeros((*ids.shape, 3), np.uint8)
     by_id = {element.id: element for element in ruleset.elements}
     for cell in np.ndindex(ids.shape):
@@ -74,7 +74,7 @@ def ramped(ruleset: Ruleset, ids: np.ndarray, read) -> np.ndarray:  # type: igno
 
 
 def tinted(ruleset: Ruleset, base: np.ndarray, read) -> np.ndarray:  # type: ignore[no-untyped-def]
-    """Untinted pictures uint8 [B, H, W, 3] with the tints, cell by cell, as docs/language.md says."""
+    """Untinted pictures uint8 [B, H, W, 3] with the tints, cell by cell, as docs/language/elements.md says."""
     one, top = np.float32(1), np.float32(255)
     picture = base.copy()
     for field in ruleset.fields:
