@@ -17,6 +17,7 @@ import textwrap
 from collections.abc import Callable, Iterable
 from functools import partial
 from pathlib import Path
+from types import UnionType
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # runs from a checkout that is not installed
 
@@ -40,7 +41,7 @@ from powderdsl.model.elaborate import MAX_MOMENTS, MAX_RULES
 from powderdsl.model.examples import MAX_SIDE
 from powderdsl.model.expressions.typer import MAX_ROUNDS, MAX_SET_DEPTH
 from powderdsl.model.operations import FUNCTIONS
-from powderdsl.model.schema import MAX_NAME, RECORDS, keys_of
+from powderdsl.model.schema import MAX_NAME, RECORDS, Key, Record, keys_of
 from powderdsl.model.text import show_offset
 from powderdsl.model.types import Kernel
 from powderdsl.syntax import parse, yaml_tree
@@ -56,15 +57,15 @@ MARKED = re.compile(r"(<!-- generated: ([\w ]+) -->\n).*?(<!-- end -->)", re.DOT
 
 SHAPES = {
     "text": "text",
-    "word": "a word",
+    "word": "word",
     "words": "words",
-    "number": "a number",
+    "number": "integer",
     "flag": "`yes` or `no`",
-    **dict.fromkeys(("mapping", "record", "section", "pairs"), "a mapping"),
-    "list": "a list",
+    **dict.fromkeys(("mapping", "record", "section", "pairs"), "mapping"),
+    "list": "list",
     "lines": "expressions",
-    "line": "an expression",
-    "block": "a block",
+    "line": "expression",
+    "block": "block",
     "invariants": "invariants",
     "any": "see below",
 }
@@ -79,14 +80,34 @@ def table(head: tuple[str, ...], rows: Iterable[tuple[str, ...]]) -> str:
 
 
 def keys(context: str) -> str:
-    """The keys of one kind of mapping in a rule file."""
+    """The keys of one kind of mapping in a rule file, with their values and defaults."""
+    record = RECORDS[context]
     rows = [
-        (f"`{name}`" + (" *" if key.required else ""), SHAPES[key.shape], key.about)
-        for name, key in keys_of(RECORDS[context]).items()
+        (f"`{name}`" + (" *" if key.required else ""), value_of(key, record), key.about)
+        for name, key in keys_of(record).items()
     ]
-    if others := RECORDS[context].OTHERS:
-        rows.append((f"*{others}'s name*", "an expression", "its value"))
-    return table(("key", "value", "what it says"), rows)
+    if record.OTHERS:
+        rows.append((f"*{record.OTHERS}'s name*", "expression", "its value"))
+    return table(("key", "value", "meaning"), rows)
+
+
+def value_of(key: Key, record: type[Record]) -> str:
+    """The shape, the bounds and the default of a key's value."""
+    if key.choices:
+        *first, last = (f"`{choice}`" for choice in key.choices)
+        shape = f"{', '.join(first)} or {last}" if first else last
+    elif key.form:
+        shape = key.form.noun.removeprefix("a ")
+    elif key.shape == "number" and key.bounds[1]:
+        shape = f"{key.bounds[0]}..{key.bounds[1]:,}"
+    elif key.shape == "any" and not isinstance(key.type, UnionType):
+        shape = "mapping or list"
+    else:
+        shape = SHAPES[key.shape]
+    default = getattr(record, key.field, None)
+    if key.required or default in (None, "", ()):
+        return shape
+    return f"{shape}, default `{'no' if default is False else default}`"
 
 
 def directions() -> str:
@@ -159,17 +180,25 @@ def limits() -> str:
     return table(("what", "at most"), [(what, f"{most:,}") for what, most in rows])
 
 
-def shipped() -> str:
-    """The packs and rulesets that come with powderdsl."""
+def shipped(rulesets: bool = False) -> str:
+    """The packs, or the rulesets, that come with powderdsl."""
     from powderdsl.compiler import read
     from powderdsl.diagnostics import Reporter
 
     rows = []
     for name in shipped_rules():
         packs, ruleset = read([name], Reporter())
-        about = ruleset.about if ruleset else packs[-1].about  # those that it needs come first
-        rows.append((f"`{name}`", "ruleset" if ruleset else "pack", about))
-    return table(("name", "", "what it is"), rows)
+        if ruleset and rulesets:
+            rows.append((f"`{name}`", ", ".join(ruleset.members), ruleset.about))
+        elif not ruleset and not rulesets:
+            pack = packs[-1]  # its needs come first
+            words = (
+                ", ".join(scalar.text for scalar in pack.needs),
+                ", ".join(e.name.text for e in pack.elements),
+            )
+            rows.append((f"`{name}`", *words, pack.about))
+    head = ("ruleset", "packs") if rulesets else ("pack", "needs", "elements")
+    return table((*head, "description"), rows)
 
 
 def scene_statements() -> str:
@@ -320,7 +349,8 @@ TABLES: dict[str, Callable[[], str]] = {
     "kinds": kinds,
     "words": words,
     "limits": limits,
-    "shipped": shipped,
+    "shipped packs": shipped,
+    "shipped rulesets": partial(shipped, rulesets=True),
     "scene statements": scene_statements,
     "tasks": tasks,
     "task families": partial(tasks, families=True),

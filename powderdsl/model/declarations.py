@@ -63,35 +63,31 @@ class TagDecl(Definition, noun="a tag"):
 
 class PropertyDecl(Definition, noun="a property", others="an element"):
     type: Syntax | None = keyed("its kind", required=True, short=True)
-    default: Syntax | None = keyed("the value of elements that do not say")
-    about: str = keyed("what it is, in a sentence", "")
+    default: Syntax | None = keyed("the value for all other elements")
+    about: str = keyed("a one-sentence description", "")
 
 
 class TintDecl(Entry, noun="a tint"):
     """The tint that a field gives cells in pictures, as written."""
 
-    color: str = keyed(
-        'the color that cells are tinted toward, quoted: "#RRGGBB"', MISSING, name="to", form=COLOR
-    )
-    full: int = keyed("the length at which a cell would have that color", MISSING, bounds=(1, 1000))
-    most: Syntax | None = keyed(
-        "the most of that color that a cell can have, such as `50%`; all of it by default"
-    )
+    color: str = keyed('the color that cells are tinted toward: "#RRGGBB"', MISSING, name="to", form=COLOR)
+    full: int = keyed("the length of the vector at full tint", MISSING, bounds=(1, 1000))
+    most: Syntax | None = keyed("the maximum share of the color; `100%` by default")
 
 
 class FieldDecl(Definition, noun="a field", others="an element"):
     type: Syntax | None = keyed("its kind", required=True)
     at: str = keyed(
-        "`element`: it travels with it; `place`: it stays",
+        "`element`: moves with the element; `place`: stays in the cell",
         "place",
         required=True,
         choices=("element", "place"),
     )
-    default: Syntax | None = keyed("its value in a fresh cell; that of one element beside it, by its name")
-    of: Syntax | None = keyed("the elements that have it; others read the default")
-    resets: str | None = keyed("`step`: back to the default when a step starts", choices=("step",))
-    tint: TintDecl | None = keyed("how it tints cells in pictures, if it is a vector")
-    about: str = keyed("what it is, in a sentence", "")
+    default: Syntax | None = keyed("its value in fresh cells")
+    of: Syntax | None = keyed("the elements that have it; all by default")
+    resets: str | None = keyed("`step`: reset to the default at the start of each step", choices=("step",))
+    tint: TintDecl | None = keyed("how a vector field tints cells in pictures")
+    about: str = keyed("a one-sentence description", "")
 
 
 class ScratchDecl(Entry, noun="a scratch field"):
@@ -100,8 +96,8 @@ class ScratchDecl(Entry, noun="a scratch field"):
 
 class ParamDecl(Definition, noun="a parameter"):
     type: Syntax | None = keyed("its kind", required=True)
-    default: Syntax | None = keyed("its value unless the user says otherwise", required=True, short=True)
-    about: str = keyed("what it does, in a sentence", "")
+    default: Syntax | None = keyed("its value unless overridden", required=True, short=True)
+    about: str = keyed("a one-sentence description", "")
 
 
 TypedDecl = PropertyDecl | FieldDecl | ParamDecl
@@ -110,28 +106,22 @@ TypedDecl = PropertyDecl | FieldDecl | ParamDecl
 class RampDecl(Entry, noun="a color_by"):
     """The color of an element as a function of a field, as written. `start` is None for the element's own color."""
 
-    field: Scalar = keyed("the field that the color follows", MISSING)
+    field: Scalar = keyed("the field that determines the color", MISSING)
     start: str | None = keyed(
-        "the color at the low end of the range, quoted; the element's own by default", name="from", form=COLOR
+        "the color at the low end; the element's own by default", name="from", form=COLOR
     )
-    end: str = keyed(
-        'the color at the high end of the range, quoted: "#RRGGBB"', MISSING, name="to", form=COLOR
-    )
-    over: Syntax | None = keyed("the range, LOW..HIGH; all values of the field by default")
+    end: str = keyed('the color at the high end: "#RRGGBB"', MISSING, name="to", form=COLOR)
+    over: Syntax | None = keyed("the range LOW..HIGH; the field's by default")
 
 
 class ElementDecl(Definition, noun="an element", others="a property or field"):
-    id: Scalar | None = keyed(
-        "the number it asks for, 0 to 255; a free one otherwise", bounds=(0, 255), shape="number"
-    )
-    color: str = keyed('its color, quoted: "#RRGGBB"', "#000000", required=True, form=COLOR)
-    ramp: RampDecl | None = keyed("how its color follows a field", name="color_by")
-    glyph: str = keyed(
-        "one character for ASCII art; the first free letter of its name otherwise", "", form=GLYPH
-    )
-    about: str = keyed("what it is, in a sentence", "")
-    tags: Words = keyed("the tags it carries", ())
-    override: bool = keyed("yes: replaces an element of another pack", False)
+    id: Scalar | None = keyed("the preferred id; a free one by default", bounds=(0, 255), shape="number")
+    color: str = keyed('its color in quotes: "#RRGGBB"', "#000000", required=True, form=COLOR)
+    ramp: RampDecl | None = keyed("how its color depends on a field", name="color_by")
+    glyph: str = keyed("its character in ASCII drawings; a letter of its name by default", "", form=GLYPH)
+    about: str = keyed("a one-sentence description", "")
+    tags: Words = keyed("its tags", ())
+    override: bool = keyed("`yes` replaces an element of another pack", False)
 
     @property
     def number(self) -> int | None:
@@ -143,17 +133,18 @@ class AlsoDecl(Definition, others="a property or field"):
     """Tags, values, a color and a ramp that a pack adds to an element of another pack, or a ruleset to one of its packs'."""
 
     tags: Words = keyed("tags to add", (), short=True)
-    color: str | None = keyed('another color, quoted: "#RRGGBB"', form=COLOR)
-    ramp: RampDecl | None = keyed("how its color follows a field", name="color_by")
+    color: str | None = keyed('another color in quotes: "#RRGGBB"', form=COLOR)
+    ramp: RampDecl | None = keyed("how its color depends on a field", name="color_by")
 
 
 class KernelDecl(Definition, noun="a kernel"):
     rows: tuple[tuple[int, ...], ...] = keyed(
-        "rows of integer weights, an odd number of each, at most 31", (), shape="words"
+        "rows of integer weights; odd numbers of rows and columns", (), shape="words"
     )
-    shape: Syntax | None = keyed("instead of rows: a shape and its radius, `disc(3)`")
+    shape: Syntax | None = keyed("a shape with its radius instead: `disc(3)`")
     edges: str | None = keyed(
-        "`nothing` (the default) or `wrap`: what lies outside the grid", choices=("nothing", "wrap")
+        "whether counting stops at the edges of the grid, which is the default, or wraps",
+        choices=("nothing", "wrap"),
     )
 
     @property
@@ -162,8 +153,8 @@ class KernelDecl(Definition, noun="a kernel"):
 
 
 class StreamDecl(Definition, noun="a stream"):
-    bits: int = keyed("resolution of a draw: 16 or 32", 16, choices=("16", "32"))
-    about: str = keyed("what it is for", "")
+    bits: int = keyed("the bits of a draw", 16, choices=("16", "32"))
+    about: str = keyed("a one-sentence description", "")
 
 
 class SetDecl(Definition, noun="a set"):
@@ -174,22 +165,20 @@ class Block(Record, noun="a block", prefixes=("for ", "repeat ")):
     """A block of a pass: lets, then one action (a substep of rules, or further blocks, maybe in a loop), then the rest."""
 
     lets: tuple[Pair, ...] = keyed(
-        "names for values, fixed here, in order, before the rules run", (), name="let"
+        "named values, computed in order before the block's action", (), name="let"
     )
     header: Syntax | None = None
     rules: tuple[Syntax, ...] = keyed(
-        "a rule, a list of rules (one substep), or blocks in sequence", (), name="do", shape="block"
+        "a rule, a list of rules (one substep), or a list of blocks", (), name="do", shape="block"
     )
     blocks: tuple[Block, ...] = ()
-    then: tuple[Block, ...] = keyed(
-        "what comes after: a rule, a list of rules (one substep), or blocks in sequence", (), shape="block"
-    )
+    then: tuple[Block, ...] = keyed("what happens afterwards; the same forms as `do`", (), shape="block")
     symmetry: str | None = keyed(
-        "`mirror`, `rotations` or `all`: the rules hold in these orientations at once",
+        "the orientations in which the rules apply",
         choices=("mirror", "rotations", "all"),
     )
     conflicts: str | None = keyed(
-        "`drop_both`, `first_wins` or `overwrite`: what happens when rules claim one cell",
+        "which rules win when several claim the same cell",
         choices=("drop_both", "first_wins", "overwrite"),
     )
 
@@ -206,39 +195,35 @@ class Block(Record, noun="a block", prefixes=("for ", "repeat ")):
 
 
 class PassDecl(Block, Definition, noun="a pass"):
-    about: str = keyed("what it does, in a sentence", "")
-    after: Words = keyed("passes that come before it", ())
-    before: Words = keyed("passes that come after it", ())
-    override: bool = keyed("yes: replaces a pass of another pack, in its place", False)
-    scratch: tuple[ScratchDecl, ...] = keyed(
-        "fields of this pass alone, which start at their default: a kind each", ()
-    )
+    about: str = keyed("a one-sentence description", "")
+    after: Words = keyed("passes that run before this one", ())
+    before: Words = keyed("passes that run after this one", ())
+    override: bool = keyed("`yes` replaces a pass of another pack", False)
+    scratch: tuple[ScratchDecl, ...] = keyed("fields that exist only during this pass: names and kinds", ())
 
 
 class TestDecl(Entry, noun="a test"):
-    given: Scalar | None = keyed("the start world, in ASCII", shape="text")
+    given: Scalar | None = keyed("the start world, an ASCII drawing", shape="text")
     legend: tuple[tuple[Scalar, Scalar], ...] = keyed(
-        "what the characters mean, where glyphs will not do", (), maps="characters to elements"
+        "characters and their elements, where glyphs do not suffice", (), maps="characters to elements"
     )
     fields: tuple[tuple[Scalar, Scalar], ...] = keyed(
-        "values of fields in the start world, a word a cell; `.` is the default",
+        "field values in the start world; `.` is the default",
         (),
         maps="fields to drawings",
     )
-    params: tuple[Pair, ...] = keyed(
-        "values of parameters in this test alone", (), maps="parameters to values"
-    )
-    steps: int = keyed("how many steps it runs: `50 steps`", 1, name="after", shape="text", form=STEPS)
-    expect: Scalar | None = keyed("what the world looks like then; `?` matches anything", shape="text")
+    params: tuple[Pair, ...] = keyed("parameter values for this test", (), maps="parameters to values")
+    steps: int = keyed("the number of steps: `50 steps`", 1, name="after", shape="text", form=STEPS)
+    expect: Scalar | None = keyed("the world at the end; `?` matches anything", shape="text")
     expect_fields: tuple[tuple[Scalar, Scalar], ...] = keyed(
-        "values of fields then; `?` matches anything, `LOW..HIGH` a range", (), maps="fields to drawings"
+        "field values at the end; `?` matches anything, `LOW..HIGH` a range", (), maps="fields to drawings"
     )
     always: tuple[Syntax, ...] = keyed("conditions that hold in every cell after every step", ())
     often: tuple[tuple[Syntax, Syntax], ...] = keyed(
-        "how likely cells become something else: `egg -> hen: 2%`", (), shape="any"
+        "changes of cells and their chances: `egg -> hen: 2%`", (), shape="any"
     )
     """Changes of cells, as `before -> after`, and their chances."""
-    seed: int | None = keyed("the seed; several are tried without one", bounds=(0, 2**31 - 1))
+    seed: int | None = keyed("the seed; five seeds by default", bounds=(0, 2**31 - 1))
 
 
 SHARED = ("elements", "tags", "properties", "fields", "streams", "kernels", "sets")
@@ -250,31 +235,25 @@ class PackDecl(Record, noun="a pack"):
 
     name: Scalar = keyed("the pack's name", MISSING, name="pack")
     source: Source
-    about: str = keyed("what it is, in a sentence", "")
-    needs: Words = keyed("packs that must be loaded too", ())
-    provides: Words = keyed("packs that it stands in for, where others need them", ())
-    conflicts: Words = keyed("packs that must not be loaded too", ())
-    tags: tuple[TagDecl, ...] = keyed(
-        "tags that other packs give to their elements, with a sentence each", ()
-    )
+    about: str = keyed("a one-sentence description", "")
+    needs: Words = keyed("packs to load with this one", ())
+    provides: Words = keyed("packs that it can replace where others need them", ())
+    conflicts: Words = keyed("packs that must not be loaded with this one", ())
+    tags: tuple[TagDecl, ...] = keyed("tags and their descriptions", ())
     properties: tuple[PropertyDecl, ...] = keyed("numbers that every element has", ())
-    fields: tuple[FieldDecl, ...] = keyed("state that cells carry", ())
-    streams: tuple[StreamDecl, ...] = keyed(
-        "sources of random numbers that rules share by name", (), shape="any"
-    )
-    params: tuple[ParamDecl, ...] = keyed("numbers that users override without editing the file", ())
+    fields: tuple[FieldDecl, ...] = keyed("state of cells", ())
+    streams: tuple[StreamDecl, ...] = keyed("shared sources of random numbers", (), shape="any")
+    params: tuple[ParamDecl, ...] = keyed("numbers that users can override", ())
     side_multiple: int = keyed(
-        "rows and columns of all worlds are multiples of this number", 1, bounds=(1, MAX_SIDE_MULTIPLE)
+        "a divisor of the numbers of rows and columns of all worlds", 1, bounds=(1, MAX_SIDE_MULTIPLE)
     )
     kernels: tuple[KernelDecl, ...] = keyed("neighborhoods for `count` and `sum`", ())
     sets: tuple[SetDecl, ...] = keyed("names for sets of elements", ())
     elements: tuple[ElementDecl, ...] = keyed("the pack's elements", ())
-    also: tuple[AlsoDecl, ...] = keyed("tags and values for elements of other packs", ())
+    also: tuple[AlsoDecl, ...] = keyed("tags, values and colors for elements of other packs", ())
     passes: tuple[PassDecl, ...] = keyed("what happens in a step", ())
-    invariants: tuple[Syntax, ...] = keyed(
-        "what is true of every world, a statement a line", (), shape="invariants"
-    )
-    tests: tuple[TestDecl, ...] = keyed("small worlds, and what becomes of them", (), shape="list")
+    invariants: tuple[Syntax, ...] = keyed("statements that hold in every world", (), shape="invariants")
+    tests: tuple[TestDecl, ...] = keyed("small worlds and what becomes of them", (), shape="list")
 
     @property
     def entries(self) -> tuple[ElementDecl | AlsoDecl, ...]:
@@ -294,23 +273,19 @@ class RulesetDecl(Record, noun="a ruleset"):
 
     name: Scalar = keyed("the ruleset's name", MISSING, name="ruleset")
     source: Source
-    about: str = keyed("what it is, in a sentence", "")
-    extends: Scalar | None = keyed("a ruleset that this one takes over, with all that it says")
-    packs: Words = keyed("the packs it is made of, besides those of the ruleset that it extends", ())
-    without: Words = keyed("packs of the ruleset that it extends, which are left out", ())
-    slots: int | None = keyed("how many element ids there are, vacant ones included", bounds=(1, 256))
+    about: str = keyed("a one-sentence description", "")
+    extends: Scalar | None = keyed("a ruleset to inherit from")
+    packs: Words = keyed("its packs, in addition to inherited ones", ())
+    without: Words = keyed("inherited packs to leave out", ())
+    slots: int | None = keyed("the number of element ids, including unused ones", bounds=(1, 256))
     matrix: Words = keyed("the channels of `World.matrix()`", ())
     rename: tuple[tuple[Scalar, Scalar], ...] = keyed(
-        "other names for what packs define: `pack.word: name`", (), maps="qualified names to names"
+        "other names for definitions: `pack.word: name`", (), maps="qualified names to names"
     )
     """Qualified names, and the names by which these definitions are known here."""
-    params: tuple[Pair, ...] = keyed(
-        "other values for the packs' parameters", (), maps="parameters to values"
-    )
-    also: tuple[AlsoDecl, ...] = keyed("other tags, values and colors for elements of its packs", ())
-    invariants: tuple[Syntax, ...] = keyed(
-        "what is true of every world, a statement a line", (), shape="invariants"
-    )
+    params: tuple[Pair, ...] = keyed("other values of parameters", (), maps="parameters to values")
+    also: tuple[AlsoDecl, ...] = keyed("tags, values and colors for elements of its packs", ())
+    invariants: tuple[Syntax, ...] = keyed("statements that hold in every world", (), shape="invariants")
     left_out: Mapping[str, PackDecl] = field(default_factory=dict)
     """Packs of its own that are not loaded: the ids of their elements stay reserved."""
     base: RulesetDecl | None = None

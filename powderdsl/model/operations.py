@@ -96,7 +96,7 @@ _TABLE = (
     # Neighborhoods
     Operation(
         "count",
-        "how many cells of the neighborhood hold; `box` if none is named",
+        "the number of cells in the neighborhood that match; `box` by default",
         "count(SET in KERNEL)",
         most=16,
     ),
@@ -104,7 +104,7 @@ _TABLE = (
     Operation("at", "the neighbor ROWS down and COLUMNS right", "at(ROWS, COLUMNS)"),
     Operation(
         "inside",
-        "whether that neighbor lies inside the grid, without wrapping",
+        "whether that neighbor lies inside the grid",
         "inside(PLACE)",
         (PLACE,),
         FLAG,
@@ -113,19 +113,15 @@ _TABLE = (
     # Vectors
     Operation("octant", "the direction a vector points to", "octant(VEC2)", (VEC2,), DIRECTION),
     Operation("length", "the length of a vector", "length(VEC2)", (VEC2,), REAL),
-    Operation("vector", "a vec2 from two numbers", "vector(ROWS, COLUMNS)", (REAL, REAL), VEC2),
+    Operation("vector", "a vector of two numbers", "vector(ROWS, COLUMNS)", (REAL, REAL), VEC2),
     Operation("row_part", "the first component of a vec2"),
     Operation("column_part", "the second component of a vec2"),
     # Numbers
+    Operation("min", "the smallest number", "min(A, B)", (NUMBER,), most=8, evaluate=min, monotone=True),
+    Operation("max", "the largest number", "max(A, B)", (NUMBER,), most=8, evaluate=max, monotone=True),
+    Operation("abs", "the absolute value", "abs(A)", (NUMBER,), evaluate=abs, bounds=_abs_bounds),
     Operation(
-        "min", "the smaller of two numbers", "min(A, B)", (NUMBER,), most=8, evaluate=min, monotone=True
-    ),
-    Operation(
-        "max", "the larger of two numbers", "max(A, B)", (NUMBER,), most=8, evaluate=max, monotone=True
-    ),
-    Operation("abs", "a number without its sign", "abs(A)", (NUMBER,), evaluate=abs, bounds=_abs_bounds),
-    Operation(
-        "clamp", "a number kept between two bounds", "clamp(A, LOW, HIGH)", meaning="min(max(A, LOW), HIGH)"
+        "clamp", "the number, limited to the bounds", "clamp(A, LOW, HIGH)", meaning="min(max(A, LOW), HIGH)"
     ),
     Operation("add", sign="+", binds=5, evaluate=operator.add, monotone=True),
     Operation("sub", sign="-", binds=5, evaluate=operator.sub, monotone=True),
@@ -145,22 +141,22 @@ _TABLE = (
     # Directions and choices
     Operation(
         "opposite",
-        "the neighbor, or the direction, the other way",
+        "the opposite neighbor or direction",
         "opposite(PLACE)",
         evaluate=lambda a: (a + 4) % 8,
     ),
     Operation(
         "clockwise",
-        "the neighbor, or the direction, a quarter turn to the right",
+        "the neighbor or direction a quarter turn clockwise",
         "clockwise(PLACE)",
         evaluate=lambda a: (a + 2) % 8,
     ),
     Operation(
         "counterclockwise",
-        "the neighbor, or the direction, a quarter turn to the left",
+        "the neighbor or direction a quarter turn counterclockwise",
         "counterclockwise(PLACE)",
     ),
-    Operation("pick", "one of the values, each as likely as the others", "pick(DRAW, A, B, …)", most=17),
+    Operation("pick", "one of the values, all equally likely", "pick(DRAW, A, B, …)", most=17),
     Operation(
         "choose",
         "condition, value if it holds, value otherwise",
