@@ -121,9 +121,9 @@ LAYERS: dict[str, tuple[str, ...]] = {
     ),
     # Calls commands, in processes of their own.
     "experiments.studies": (*_FRONT, "compiler", "experiments.runs"),
-    "web": (*_BACK, "simulation.standalone", *_WORLDS, "tasks", "tasks.tensors"),
-    "web.bridge": (*_SCREEN, "simulation.standalone", *_TESTING),
     "editing": (*_COMPILER, "worlds", "tasks", "experiments.studies"),
+    "web": (*_BACK, "simulation.standalone", *_WORLDS, "tasks", "tasks.tensors", "editing"),
+    "web.bridge": (*_SCREEN, "simulation.standalone", *_TESTING, "editing"),
     "cli": (
         *_SCREEN,
         "editing",

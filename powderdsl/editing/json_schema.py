@@ -2,22 +2,30 @@
 
 from __future__ import annotations
 
+import json
 from functools import cache
+from pathlib import Path
 from typing import Any
 
 from powderdsl.editing.records import SCALAR, JsonSchema, entries, one_or_list
-from powderdsl.experiments.studies.study import AxisDecl, Measure, StudyDecl
 from powderdsl.model.declarations import KernelDecl, PackDecl, RulesetDecl, StreamDecl, TestDecl
-from powderdsl.tasks.agents import ExpertDecl, MoveDecl
-from powderdsl.tasks.file import StandDecl, TaskDecl
-from powderdsl.worlds.scene.read import FileDecl, SceneDecl
 
 TITLE = "Files of powderdsl: packs, rulesets, tasks, scenes and studies"
+
+MADE = Path(__file__).parents[1] / "data" / "schema.json"
+"""The schema in the archive for Pyodide, which lacks the modules of tasks and studies."""
 
 
 @cache
 def schema() -> dict[str, Any]:
     """The JSON Schema of all kinds of files: the first key that a file has decides."""
+    if MADE.is_file():
+        return dict(json.loads(MADE.read_text(encoding="utf-8")))
+    from powderdsl.experiments.studies.study import AxisDecl, Measure, StudyDecl
+    from powderdsl.tasks.agents import ExpertDecl, MoveDecl
+    from powderdsl.tasks.file import StandDecl, TaskDecl
+    from powderdsl.worlds.scene.read import FileDecl, SceneDecl
+
     records = JsonSchema()
     listed = {"type": "array", "items": SCALAR}
     pair = {**listed, "minItems": 2, "maxItems": 2}

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import cache
 
 from powderdsl.diagnostics import Source, Span
 from powderdsl.model.builtins import COORDINATES, DIRECTION_SETS, DIRECTIONS, KERNELS
@@ -65,17 +66,17 @@ def definitions(packs: Sequence[PackDecl]) -> Iterator[Word]:
                 yield Word(entry.name.text, KINDS[type(entry)], about, entry.name.span, pack.name.text)
 
 
-def language_words() -> Iterator[Word]:
+@cache
+def language_words() -> tuple[Word, ...]:
     """The words of the language itself."""
-    for function in FUNCTIONS.values():
-        yield Word(function.name, "function", f"`{function.usage}`: {function.about}")
+    words = [
+        Word(function.name, "function", f"`{function.usage}`: {function.about}")
+        for function in FUNCTIONS.values()
+    ]
     for kind, names in (("direction", DIRECTIONS), ("directions", DIRECTION_SETS), ("kernel", KERNELS)):
-        for name in names:
-            yield Word(name, kind)
-    for name in sorted(
-        {*reserved_words(), *COORDINATES} - {*FUNCTIONS, *DIRECTIONS, *DIRECTION_SETS, *KERNELS}
-    ):
-        yield Word(name, "keyword")
+        words += [Word(name, kind) for name in names]
+    others = {*reserved_words(), *COORDINATES} - {word.name for word in words}
+    return (*words, *(Word(name, "keyword") for name in sorted(others)))
 
 
 def occurrences(name: str, sources: Iterable[Source]) -> Iterator[Span]:

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from powderdsl.compiler import load_with_diagnostics, read, shipped_rules
 from powderdsl.diagnostics import CompileError, Diagnostic, Reporter, Source, Span
 from powderdsl.editing.cursor import Cursor, cursor_at, keys_at, values_at
 from powderdsl.editing.words import Word, definitions, language_words, occurrences
-from powderdsl.experiments.studies.study import Commands
 from powderdsl.model.builtins import RESERVED
 from powderdsl.model.declarations import PackDecl
 from powderdsl.model.schema import NAME
@@ -19,6 +19,9 @@ from powderdsl.model.types import Ruleset
 from powderdsl.syntax.parse import reserved_words
 from powderdsl.syntax.sources import OPEN, shipped
 from powderdsl.syntax.yaml_tree import Mapping, Node, Scalar, parse_yaml
+
+if TYPE_CHECKING:
+    from powderdsl.experiments.studies.study import Commands
 
 KIND = re.compile(r"^(pack|ruleset|task|study|scenes?):", re.MULTILINE)
 PACKS = ("needs", "packs", "without", "provides", "conflicts", "extends", "rules", "rulesets")
@@ -46,11 +49,18 @@ class Symbol:
 
 @dataclass
 class Rules:
-    """The packs last read for a file, and the model of the last text without mistakes."""
+    """The packs last read for a file, their words, and the model of the last text without mistakes."""
 
     packs: list[PackDecl] = field(default_factory=list)
     model: Ruleset | None = None
     words: dict[str, list[Word]] = field(default_factory=dict)
+
+    def read(self, names: Sequence[str | Path]) -> None:
+        """Read the packs that some names mean; the last ones stay if there are none."""
+        if packs := read(names, Reporter())[0]:
+            self.packs, self.words = packs, {}
+            for word in (*language_words(), *definitions(packs)):
+                self.words.setdefault(word.name, []).append(word)
 
     @property
     def sources(self) -> list[Source]:
@@ -67,7 +77,6 @@ class Workspace:
     def __init__(self, beside: str = "", commands: Callable[[], Commands] = dict):
         self.beside, self.commands = beside, commands
         self.rules: dict[Path, Rules] = {}
-        self._language = [*language_words()]
 
     def open(self, path: Path, text: str) -> None:
         """A file is open, or its text has changed."""
@@ -83,8 +92,7 @@ class Workspace:
 
     def kind(self, path: Path) -> str:
         """The key that says what a file is; `pack` if none does yet."""
-        match = KIND.search(self.text(path))
-        return match[1] if match else "pack"
+        return kind_of(self.text(path))
 
     # Mistakes
 
@@ -120,51 +128,19 @@ class Workspace:
                     known.model, remarks = load_with_diagnostics(*names)
         except CompileError as error:
             remarks = error.diagnostics
-        packs = read(names, Reporter())[0]
-        if packs:
-            known.packs, known.words = packs, {}
-            for word in (*self._language, *definitions(packs)):
-                known.words.setdefault(word.name, []).append(word)
+        known.read(names)
         return remarks
 
     # At a place
 
     def complete(self, path: Path, offset: int) -> list[Item]:
         """The words that fit at a place."""
-        text, kind = self.text(path), self.kind(path)
-        cursor = cursor_at(text, offset)
-        if cursor.key is None and (keys := keys_at(cursor.path, kind)):
-            return [Item(key, "key", about) for key, about in keys.items()]
-        if choices := values_at(cursor.keys, kind):
-            return [Item(choice, "value") for choice in choices]
-        last = cursor.keys[-1] if cursor.keys else ""
-        if last in PACKS:
-            beside = sorted(other.stem for other in path.parent.glob("*.yaml") if other != path)
-            return [Item(name, "pack") for name in dict.fromkeys([*beside, *shipped_rules()])]
-        words = [entry for entries in self._rules(path).words.values() for entry in entries]
-        if last in ("tags", "after", "before"):
-            wanted = "tag" if last == "tags" else "pass"
-            words = [word for word in words if word.kind == wanted]
-        elif last == "about":
-            words = []
-        return [
-            Item(word.name, word.kind, word.about) for word in words if word.kind != "pass" or last != "do"
-        ]
+        beside = sorted(other.stem for other in path.parent.glob("*.yaml") if other != path)
+        return completions(self.text(path), offset, self._rules(path), beside)
 
     def hover(self, path: Path, offset: int) -> tuple[str, Span] | None:
         """The meaning of the word at a place, as Markdown, and its place."""
-        text = self.text(path)
-        cursor = cursor_at(text, offset)
-        if not cursor.word:
-            return None
-        span = Span(Source(str(path), text), cursor.start, cursor.end)
-        if cursor.key is None or text[cursor.end : cursor.end + 1] == ":":
-            about = keys_at(cursor.path, self.kind(path)).get(cursor.word)
-            if about:
-                return f"`{cursor.word}`: {about}", span
-        rules = self._rules(path)
-        parts = [_described(word, rules.model) for word in rules.words.get(cursor.word, ())]
-        return ("\n\n".join(parts), span) if parts else None
+        return explanation(Source(str(path), self.text(path)), offset, self._rules(path))
 
     def definition(self, path: Path, offset: int) -> list[Span]:
         """The definitions of the word at a place."""
@@ -209,6 +185,46 @@ class Workspace:
         if path not in self.rules:
             self.check(path)
         return self.rules[path]
+
+
+def kind_of(text: str) -> str:
+    """The key that says what a file is; `pack` if none does yet."""
+    match = KIND.search(text)
+    return match[1] if match else "pack"
+
+
+def completions(text: str, offset: int, rules: Rules, beside: Iterable[str]) -> list[Item]:
+    """The words that fit at a place of a text. `beside` are packs that may be named, besides shipped ones."""
+    cursor, kind = cursor_at(text, offset), kind_of(text)
+    if cursor.key is None and (keys := keys_at(cursor.path, kind)):
+        return [Item(key, "key", about) for key, about in keys.items()]
+    if choices := values_at(cursor.keys, kind):
+        return [Item(choice, "value") for choice in choices]
+    last = cursor.keys[-1] if cursor.keys else ""
+    if last in PACKS:
+        return [Item(name, "pack") for name in dict.fromkeys([*beside, *shipped_rules()])]
+    words = [entry for entries in rules.words.values() for entry in entries]
+    if last in ("tags", "after", "before"):
+        wanted = "tag" if last == "tags" else "pass"
+        words = [word for word in words if word.kind == wanted]
+    elif last == "about":
+        words = []
+    return [Item(word.name, word.kind, word.about) for word in words if word.kind != "pass" or last != "do"]
+
+
+def explanation(source: Source, offset: int, rules: Rules) -> tuple[str, Span] | None:
+    """The meaning of the word at a place of a text, as Markdown, and its place."""
+    text = source.text
+    cursor = cursor_at(text, offset)
+    if not cursor.word:
+        return None
+    span = Span(source, cursor.start, cursor.end)
+    if cursor.key is None or text[cursor.end : cursor.end + 1] == ":":
+        about = keys_at(cursor.path, kind_of(text)).get(cursor.word)
+        if about:
+            return f"`{cursor.word}`: {about}", span
+    parts = [_described(word, rules.model) for word in rules.words.get(cursor.word, ())]
+    return ("\n\n".join(parts), span) if parts else None
 
 
 def _namespace(cursor: Cursor) -> str:

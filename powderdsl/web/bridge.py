@@ -17,17 +17,14 @@ from typing import Any
 
 from powderdsl.arrays import np
 from powderdsl.compiler import load_with_diagnostics, read
-from powderdsl.diagnostics import CompileError, Reporter
+from powderdsl.diagnostics import CompileError, Reporter, Source
 from powderdsl.diagnostics.diagnostic import diagnostic_data, render_text
-from powderdsl.model import declarations
-from powderdsl.model.builtins import RESERVED
+from powderdsl.editing.layout import formatted
+from powderdsl.editing.workspace import Rules, completions, explanation
 from powderdsl.model.definitions import set_params
-from powderdsl.model.operations import FUNCTIONS
-from powderdsl.model.schema import RECORDS, keys_of
 from powderdsl.model.state import qualified_slots, slot_name
 from powderdsl.model.types import Ruleset
 from powderdsl.simulation.standalone import standalone_module
-from powderdsl.syntax.parse import reserved_words
 from powderdsl.syntax.sources import shipped
 from powderdsl.system.cache import Memo
 
@@ -66,6 +63,8 @@ class Session:
         self.ruleset: Ruleset | None = None
         self.good = Selection({}, [], [])
         """The files of these rules."""
+        self.known = Rules()
+        """Words for completions and explanations."""
         self._sim: Any = None
 
     def check(self, files: Mapping[str, str], off: list[str]) -> dict[str, Any]:
@@ -79,14 +78,30 @@ class Session:
         packs: dict[str, str] = {}
         answer: dict[str, Any] = {"ok": True}
         try:
-            packs = {Path(pack.source.name).name: pack.source.text for pack in read(names, Reporter())[0]}
+            self.known.read(names)
+            packs = {Path(pack.source.name).name: pack.source.text for pack in self.known.packs}
             self.ruleset, remarks = load_with_diagnostics(*names)
-            self.good, answer["words"] = selection, _words(self.ruleset)
+            self.good, self.known.model = selection, self.ruleset
         except CompileError as error:
             answer["ok"], remarks = False, error.diagnostics
         data = [diagnostic_data(remark, utf16=True) | {"text": render_text(remark)} for remark in remarks]
         texts = {name: text for name, text in packs.items() if name not in files and NAME.fullmatch(name)}
-        return answer | {"diagnostics": data, "packs": list(packs), "texts": texts}
+        words = {name: found[0].kind for name, found in self.known.words.items()}
+        return answer | {"diagnostics": data, "packs": list(packs), "texts": texts, "words": words}
+
+    def complete(self, text: str, offset: int) -> list[dict[str, str]]:
+        """The words that fit at a place of a file, as the language server offers them."""
+        beside = [pack.name.text for pack in self.known.packs]
+        return [vars(item) for item in completions(text, offset, self.known, beside)]
+
+    def explain(self, text: str, offset: int) -> str:
+        """What the word at a place of a file means, as Markdown."""
+        found = explanation(Source("", text), offset, self.known)
+        return found[0] if found else ""
+
+    def format(self, text: str) -> str:
+        """A file in the one layout; unchanged if it cannot be read."""
+        return formatted(Source("", text), Reporter()) or text
 
     def _write(self, files: Mapping[str, str], off: list[str]) -> Selection:
         """Write the files, and select the names for `load`: rulesets, and packs that no ruleset lists."""
@@ -273,19 +288,6 @@ class Session:
 
 def _is_ruleset(text: str) -> bool:
     return re.search(r"^ruleset:", text, re.MULTILINE) is not None
-
-
-def _words(ruleset: Ruleset) -> dict[str, list[str]]:
-    """The words that the editor completes, by kind."""
-    rule_records = [kind for kind in RECORDS.values() if kind.__module__ == declarations.__name__]
-    return {
-        "element": [element.name for element in ruleset.elements],
-        "field": [field.name for field in ruleset.fields] + [prop.name for prop in ruleset.properties],
-        "parameter": [param.name.rpartition(".")[2] for param in ruleset.params],
-        "function": sorted(FUNCTIONS),
-        "keyword": sorted({*reserved_words(), *RESERVED}),
-        "key": sorted({key for kind in rule_records for key in keys_of(kind)}),
-    }
 
 
 @cache

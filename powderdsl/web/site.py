@@ -31,6 +31,8 @@ from powderdsl.analysis.changes import unchanging_ids
 from powderdsl.arrays import np
 from powderdsl.compiler import load, read, shipped_tests, shipped_variants, split_names
 from powderdsl.diagnostics import CompileError, Reporter
+from powderdsl.editing.json_schema import MADE as MADE_SCHEMA
+from powderdsl.editing.json_schema import schema
 from powderdsl.model.state import fits
 from powderdsl.model.types import Ruleset
 from powderdsl.simulation.standalone import standalone_module
@@ -467,6 +469,7 @@ def python_archive() -> bytes:
             name = f"powderdsl/data/rules/{path.relative_to(shipped('rules')).as_posix()}"
             if name not in archive.namelist():
                 _add(archive, name, path.read_bytes())
+        _add(archive, f"powderdsl/data/{MADE_SCHEMA.name}", json.dumps(schema()).encode())
         for library in LIBRARIES:
             for file in metadata.files(library) or ():
                 if not (".." in file.parts or "__pycache__" in file.parts or file.suffix in (".so", ".pyd")):

@@ -43,7 +43,9 @@ def test_broken_rules_leave_the_last_good_ones(session: bridge.Session) -> None:
     found = call("check", good, [])["result"]
     last = session.ruleset
     assert found["ok"]
-    assert set(found["words"]["element"]) == {one.name for one in last.elements}
+    kinds = found["words"]
+    assert {name for name in kinds if kinds[name] == "element"} == {one.name for one in last.elements}
+    assert (kinds["count"], kinds["below"], kinds["density"]) == ("function", "direction", "property")
     wasmtime.Module.validate(wasmtime.Engine(), call("compile", 16, 64))
     bad = good | {"sand.yaml": good["sand.yaml"].replace("density: 4", "densit: 4")}
     found = call("check", bad, [])["result"]
@@ -56,6 +58,28 @@ def test_broken_rules_leave_the_last_good_ones(session: bridge.Session) -> None:
     circle = {"a.yaml": "ruleset: a\nextends: b\n", "b.yaml": "ruleset: b\nextends: a\n"}
     assert {one["code"] for one in call("check", circle, [])["result"]["diagnostics"]} == {"PD314"}
     assert session.ruleset is last
+
+
+def test_the_page_has_the_words_and_the_layout_of_the_language_server(session: bridge.Session) -> None:
+    given = files("core", "sand")
+    call("check", given, [])
+    text = given["sand.yaml"]
+
+    def labels(text: str) -> set[str]:
+        return {item["label"] for item in call("complete", text, len(text))["result"]}
+
+    assert {"color", "tags", "glyph"} <= labels("pack: mine\nelements:\n  gold: {id: 99, col")
+    assert {"gravity"} == labels(f"{text}passes:\n  rest:\n    after: [gra") & {"gravity", "sand"}
+    assert {"sand", "count", "density"} <= labels(f"{text}passes:\n  rest:\n    do:\n      - 𝒳 be")
+    assert {"core", "water"} <= labels("pack: mine\nneeds: [")
+    about = call("explain", text, text.index("  sand:") + 4)["result"]
+    assert "**element** `sand` of pack `sand`" in about
+    assert call("explain", text, 0)["result"].startswith("`pack`: ")
+    assert call("explain", "# 𝒳", 2) == {"result": ""}
+    assert call("format", "pack: mine\nelements:\n     gold:   {id: 99}\n") == {
+        "result": "pack: mine\nelements:\n  gold: {id: 99}\n"
+    }
+    assert call("format", "pack: [") == {"result": "pack: ["}
 
 
 def test_packs_are_left_out(session: bridge.Session) -> None:

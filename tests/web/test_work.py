@@ -112,6 +112,17 @@ def test_files_links_and_tests(address: str, tmp_path: Path) -> None:
     assert "/tmp" not in found["message"]
 
 
+def test_the_editor_completes_explains_and_formats(address: str, tmp_path: Path) -> None:
+    found = script("words.mjs", address, tmp_path)
+    keys, packs, values = found["offered"].values()
+    assert "color" in "\n".join(keys)
+    assert "water" in "\n".join(packs)
+    assert values
+    assert found["about"][0].startswith("element sand of pack sand")
+    assert found["about"][1] == "element"
+    assert (found["behind"], found["undone"]) == ("glyph", True)
+
+
 @pytest.mark.parametrize("seed", tiered(range(1, 11), [1]))
 def test_random_actions_lose_nothing(address: str, tmp_path: Path, seed: int) -> None:
     found = script("actions.mjs", address, tmp_path, "500", str(seed))

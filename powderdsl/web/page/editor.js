@@ -7,9 +7,11 @@ import { HighlightStyle, bracketMatching, indentOnInput, syntaxHighlighting } fr
 import { lintGutter, setDiagnostics } from "@codemirror/lint";
 import { highlightSelectionMatches, searchKeymap } from "@codemirror/search";
 import { EditorState, StateEffect } from "@codemirror/state";
-import { Decoration, EditorView, MatchDecorator, ViewPlugin, drawSelection, keymap, lineNumbers } from "@codemirror/view";
+import { Decoration, EditorView, MatchDecorator, ViewPlugin, drawSelection, hoverTooltip, keymap, lineNumbers } from "@codemirror/view";
 import { highlightActiveLine, highlightActiveLineGutter } from "@codemirror/view";
 import { tags } from "@lezer/highlight";
+import { compiler } from "./compiler.js";
+import { make } from "./dom.js";
 
 const STYLE = HighlightStyle.define([
   { tag: tags.propertyName, class: "key" },
@@ -29,30 +31,24 @@ const THEME = EditorView.theme({
   "&.cm-focused .cm-selectionBackground, .cm-selectionBackground": { backgroundColor: "light-dark(#b9d4fb, #31507d) !important" },
   ".cm-tooltip": { backgroundColor: "var(--sheet)", border: "1px solid var(--line)", borderRadius: "6px", maxWidth: "560px" },
   ".cm-diagnostic": { whiteSpace: "pre-wrap" },
+  ".about": { whiteSpace: "pre-wrap", padding: "6px 10px" },
   ".key": { color: "light-dark(#7a2e8e, #d9a5ea)" },
   ".comment": { color: "var(--soft)", fontStyle: "italic" },
   ".string": { color: "inherit" },
   ".mark": { color: "var(--soft)" },
-  ".word-keyword": { color: "light-dark(#1f5fbf, #7db3ff)" },
+  ".word-keyword, .word-direction, .word-directions, .word-kernel": { color: "light-dark(#1f5fbf, #7db3ff)" },
   ".word-function": { color: "light-dark(#8a5a00, #f0c060)" },
   ".word-element": { color: "light-dark(#1b6b3a, #7fd69b)" },
-  ".word-field": { color: "light-dark(#9c3b12, #ffab85)" },
+  ".word-field, .word-property": { color: "light-dark(#9c3b12, #ffab85)" },
   ".word-number": { color: "light-dark(#0f6674, #7ad3e0)" },
 });
 
-const KINDS = ["keyword", "function", "element", "field", "parameter"];
-const TYPES = { element: "class", field: "property", parameter: "variable", function: "function", keyword: "keyword", key: "type" };
+/** CodeMirror's icons for kinds of words. */
+const ICONS = { element: "class", tag: "interface", field: "property", property: "property", parameter: "variable", function: "function", key: "type", pack: "namespace", value: "enum" };
 
-/** The words of the rules that are loaded, by kind; `kinds` says what a word is. */
-let words = { key: [] };
+/** The words of the loaded rules, and what each is. @type {Map<string, string>} */
 let kinds = new Map();
 const reworded = StateEffect.define();
-
-function setWords(found) {
-  words = found;
-  kinds = new Map();
-  for (const kind of [...KINDS].reverse()) for (const word of found[kind] ?? []) kinds.set(word, kind);
-}
 
 const decorator = new MatchDecorator({
   regexp: /\d+(?:\.\d+)?%?|[A-Za-z_]\w*/g,
@@ -62,7 +58,7 @@ const decorator = new MatchDecorator({
     if (/#/.test(before) && /(^|\s)#/.test(before)) return;
     if (/^\s*(-\s+)?about:/.test(line.text) || /about:\s*"?[^"]*$/.test(before)) return;
     const kind = /^\d/.test(match[0]) ? "number" : kinds.get(match[0]);
-    if (!kind || kind === "parameter") return;
+    if (!kind) return;
     if (line.text[to - line.from] === ":" && line.text[to - line.from + 1] !== "=") return;
     add(from, to, Decoration.mark({ class: `word-${kind}` }));
   },
@@ -81,17 +77,38 @@ const coloring = ViewPlugin.fromClass(
   { decorations: (plugin) => plugin.decorations },
 );
 
-/** Keys where a line begins, otherwise the words of the line language and the loaded names. */
-function complete(context) {
-  const found = context.matchBefore(/[A-Za-z_]\w*/);
-  if (!found && !context.explicit) return null;
-  const from = found?.from ?? context.pos;
-  const before = context.state.doc.lineAt(from).text.slice(0, from - context.state.doc.lineAt(from).from);
-  const atKey = /^\s*$/.test(before) || /[{,]\s*$/.test(before);
-  const options = [];
-  for (const kind of atKey ? ["key", ...KINDS] : KINDS)
-    for (const word of words[kind] ?? []) options.push({ label: word, type: TYPES[kind], detail: kind });
-  return { from, options, validFor: /^\w*$/ };
+/** A text and a place in it for Python, which counts code points. */
+const place = (doc, at) => [doc.toString(), [...doc.sliceString(0, at)].length];
+
+/** The words that fit at a place. Without an answer of the compiler there are none. */
+async function complete(context) {
+  const { state, pos, explicit } = context;
+  const { from } = context.matchBefore(/\w*/);
+  if (from === pos && !explicit) return null;
+  const found = await compiler.call("complete", ...place(state.doc, pos)).catch(() => null);
+  const options = found?.map(({ label, kind, about }) => ({ label, type: ICONS[kind] ?? "keyword", detail: kind, info: about || undefined }));
+  return options ? { from, options, validFor: /^\w*$/ } : null;
+}
+
+/** What the word at a place means: Markdown with bold words, code and paragraphs only. */
+async function explain({ state }, at) {
+  const word = state.wordAt(at);
+  if (!word) return null;
+  const found = await compiler.call("explain", ...place(state.doc, word.from)).catch(() => "");
+  const parts = found.split(/\*\*(.+?)\*\*|`(.+?)`/);
+  const nodes = parts.map((text, index) => text && (index % 3 ? make(index % 3 === 1 ? "b" : "code", {}, text) : text));
+  const create = () => ({ dom: make("div", { class: "about" }, ...nodes.filter(Boolean)) });
+  return found ? { pos: word.from, end: word.to, above: true, create } : null;
+}
+
+/** Gives the file its one layout. The cursor stays behind as many characters that are not blank. */
+async function format(view) {
+  const before = view.state.doc.toString();
+  const insert = await compiler.call("format", before).catch(() => before);
+  if (insert === before || view.state.doc.toString() !== before) return;
+  const solid = before.slice(0, view.state.selection.main.head).replace(/\s/g, "").length;
+  const behind = [...insert.matchAll(/\S/g)][solid - 1]?.index + 1 || 0;
+  view.dispatch({ changes: { from: 0, to: before.length, insert }, selection: { anchor: behind }, scrollIntoView: true });
 }
 
 export class Editor {
@@ -113,14 +130,14 @@ export class Editor {
       extensions: [
         [lineNumbers(), lintGutter(), history(), drawSelection(), highlightActiveLine(), highlightActiveLineGutter()],
         [highlightSelectionMatches(), indentOnInput(), bracketMatching(), closeBrackets()],
-        autocompletion({ override: [complete] }),
+        [autocompletion({ override: [complete] }), hoverTooltip(explain)],
         yaml(),
         syntaxHighlighting(STYLE),
         coloring,
         THEME,
         EditorView.contentAttributes.of({ tabindex: "0", "aria-label": "Rules. Escape, then Tab leaves the editor." }),
         // Escape, then Tab leaves the editor: CodeMirror's own way out for keyboards.
-        keymap.of([...completionKeymap, ...searchKeymap, ...historyKeymap, ...defaultKeymap, indentWithTab]),
+        keymap.of([{ key: "Shift-Alt-f", run: (view) => (format(view), true) }, ...completionKeymap, ...searchKeymap, ...historyKeymap, ...defaultKeymap, indentWithTab]),
         EditorView.updateListener.of((update) => {
           if (update.docChanged) this.onChange(this.name, update.state.doc.toString());
         }),
@@ -158,9 +175,9 @@ export class Editor {
     this.view.setState(this.states.get(name));
   }
 
-  /** Colors and completes these words. @param {Record<string, string[]>} found  by kind */
+  /** Colors these words. @param {Record<string, string>} found  what each is */
   know(found) {
-    setWords(found);
+    kinds = new Map(Object.entries(found));
     this.view.dispatch({ effects: reworded.of(null) });
   }
 
