@@ -1,7 +1,7 @@
 """The creatures behave as docs/creatures.md says, in the second world and in the first one.
 
-Tests inside the packs say what one step does, and the examples on the page run too. Here is which element does what to
-which creature, and how the two worlds differ.
+Tests inside the packs check single steps. These check longer runs, which element does what to which creature, and how the
+two worlds differ.
 """
 
 from __future__ import annotations
@@ -128,6 +128,62 @@ def test_kangaroos_leap_over_walls_and_climb_no_steps() -> None:
 
 
 @pytest.mark.slow
+def test_fish_swim_everywhere_in_the_water() -> None:
+    sim = simulator()
+    world = sim.step(drawn(sim, "######\n#F~~w#\n######", 100), 100)
+    assert set(np.argwhere(cells(world, "fish"))[:, 2]) == {1, 2, 3}
+
+
+def test_birds_form_flocks() -> None:
+    sim = simulator()
+    ids = np.zeros((1, 30, 30), np.uint8)  # no walls: birds that leave on one side enter on the other
+    ids[0, 3::7, 3::7] = sim.ruleset.element("bird").id
+    world = sim.step(sim.world(ids, seed=1))
+
+    def agreement(world: World) -> float:
+        """0 if headings cancel out, 1 if all birds fly the same way."""
+        birds, heading = cells(world, "bird"), to_numpy(world["flying"])
+        return float(np.hypot(*(heading * birds[:, None]).sum((2, 3))[0]) / birds.sum())
+
+    assert agreement(world) < 0.5
+    assert agreement(sim.step(world, 60)) > 0.9
+
+
+def test_moles_push_water_aside_and_eat_wood() -> None:
+    sim = simulator()
+    world = drawn(sim, "########\n#~~~www#\n#~m~www#\n#~~~www#\n########", 100)
+    later = sim.step(world, 200)
+    assert cells(later, "water").sum() == cells(world, "water").sum()
+    assert cells(later, "wood").sum() < cells(world, "wood").sum()
+
+
+def test_lemmings_climb_steps_of_one_cell() -> None:
+    sim = simulator()
+    stairs = "##########\n#........#\n#.....w..#\n#....www.#\n#L..wwww.#\n##########"
+    wall = "##########\n#........#\n#....w...#\n#L...w...#\n##########"
+    over, stopped = (
+        np.argwhere(cells(sim.step(drawn(sim, art, 50), 60), "lemming"))[:, 2] for art in (stairs, wall)
+    )
+    assert (over > 6).any()
+    assert (stopped < 5).all()
+
+
+def test_snakes_with_energy_grow_to_eleven_cells() -> None:
+    sim = simulator()
+    world = drawn(sim, "#" * 60 + "\n##S" + "." * 56 + "#\n" + "#" * 60, energy=1)
+    lengths = []
+    for _ in range(30):
+        world = sim.step(world)
+        lengths.append(int(cells(world, "snake").sum()))
+    assert lengths == [*range(2, 12)] + [11] * 20
+
+
+def test_robots_stay_where_they_land() -> None:
+    sim = simulator()
+    world = drawn(sim, "#####\n#r.r#\n#..~#\n#####")
+    assert (cells(sim.step(world, 2), "robot") == cells(sim.step(world, 100), "robot")).all()
+
+
 def test_cloners_pour_out_creatures_and_moles_and_snakes_eat_theirs() -> None:
     sim = simulator()
     start = load_start("hatchery", sim.ruleset)
