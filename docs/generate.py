@@ -13,7 +13,6 @@ import re
 import shlex
 import subprocess
 import sys
-import textwrap
 from collections.abc import Callable, Iterable
 from functools import partial
 from pathlib import Path
@@ -27,25 +26,19 @@ from powderdsl.editing.json_schema import schema
 from powderdsl.experiments.studies import study as _study_file  # noqa: F401  # declares the records of studies
 from powderdsl.ir.stages import PIPELINE
 from powderdsl.model.builtins import (
-    DIRECTION_SETS,
-    DIRECTIONS,
-    KERNELS,
     KIND_WORDS,
     MAX_MAGNITUDE,
     MAX_OFFSET,
     MAX_RADIUS,
-    RESERVED,
 )
 from powderdsl.model.composition.names import MAX_PASSES
+from powderdsl.model.declarations import COLOR
 from powderdsl.model.elaborate import MAX_MOMENTS, MAX_RULES
 from powderdsl.model.examples import MAX_SIDE
 from powderdsl.model.expressions.typer import MAX_ROUNDS, MAX_SET_DEPTH
 from powderdsl.model.operations import FUNCTIONS
 from powderdsl.model.schema import MAX_NAME, RECORDS, Key, Record, keys_of
-from powderdsl.model.text import show_offset
-from powderdsl.model.types import Kernel
 from powderdsl.syntax import parse, yaml_tree
-from powderdsl.syntax.parse import reserved_words
 from powderdsl.tasks import file as _task_file  # noqa: F401  # declares the records of tasks
 from powderdsl.worlds.scene.statements import SETTING, STATEMENTS
 
@@ -72,6 +65,10 @@ SHAPES = {
 """Shapes of `schema.Key`, as readers see them."""
 
 
+BELOW_PACKS = ("element", "field", "param", "pass", "property", "stream")
+"""Entries of packs that all have the key `about`, which the table of packs explains."""
+
+
 def table(head: tuple[str, ...], rows: Iterable[tuple[str, ...]]) -> str:
     """A Markdown table; `|` inside cells is escaped."""
     lines = ["| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
@@ -85,6 +82,7 @@ def keys(context: str) -> str:
     rows = [
         (f"`{name}`" + (" *" if key.required else ""), value_of(key, record), key.about)
         for name, key in keys_of(record).items()
+        if name != "about" or context not in BELOW_PACKS
     ]
     if record.OTHERS:
         rows.append((f"*{record.OTHERS}'s name*", "expression", "its value"))
@@ -96,6 +94,8 @@ def value_of(key: Key, record: type[Record]) -> str:
     if key.choices:
         *first, last = (f"`{choice}`" for choice in key.choices)
         shape = f"{', '.join(first)} or {last}" if first else last
+    elif key.form is COLOR:
+        shape = '`"#RRGGBB"`'
     elif key.form:
         shape = key.form.noun.removeprefix("a ")
     elif key.shape == "number" and key.bounds[1]:
@@ -110,34 +110,6 @@ def value_of(key: Key, record: type[Record]) -> str:
     return f"{shape}, default `{'no' if default is False else default}`"
 
 
-def directions() -> str:
-    rows = [(f"`{name}`", f"({dy}, {dx})") for name, (dy, dx) in DIRECTIONS.items()]
-    return table(("name", "(rows down, columns right)"), rows)
-
-
-def direction_sets() -> str:
-    def listed(name: str) -> str:
-        return ", ".join(_path(offset) for offset in DIRECTION_SETS[name])
-
-    return table(("set", "in this order"), [(f"`{name}`", listed(name)) for name in DIRECTION_SETS])
-
-
-def _path(offset: tuple[int, int]) -> str:
-    """`above.left` for a diagonal, `above` for the rest."""
-    dy, dx = offset
-    parts = [show_offset((dy, 0))] * (dy != 0) + [show_offset((0, dx))] * (dx != 0)
-    return f"`{'.'.join(parts)}`"
-
-
-def kernels() -> str:
-    def drawn(kernel: Kernel) -> str:
-        weights = {(dy, dx): weight for dy, dx, weight in kernel.weights}
-        reach = range(-kernel.radius, kernel.radius + 1)
-        return " / ".join(" ".join(str(weights.get((dy, dx), 0)) for dx in reach) for dy in reach)
-
-    return table(("kernel", "rows"), [(f"`{name}`", drawn(kernel)) for name, kernel in KERNELS.items()])
-
-
 def functions() -> str:
     return table(("function", "value"), [(f"`{f.usage}`", f.about) for f in FUNCTIONS.values()])
 
@@ -148,36 +120,29 @@ def kinds() -> str:
     return table(("kind", "values"), rows)
 
 
-def words() -> str:
-    """Every word that no definition may take."""
-    listed = sorted(RESERVED | reserved_words() | {"elements"})
-    return textwrap.fill(", ".join(f"`{word}`" for word in listed) + ".", width=120) + "\n"
-
-
 def limits() -> str:
     rows = [
-        ("characters in a rule file", yaml_tree.MAX_CHARACTERS),
-        ("values in a rule file", yaml_tree.MAX_NODES),
-        ("depth of nesting in YAML", yaml_tree.MAX_DEPTH),
-        ("characters in one rule", parse.MAX_LENGTH),
-        ("depth of nesting in one rule", parse.MAX_DEPTH),
+        ("characters in a file", yaml_tree.MAX_CHARACTERS),
+        ("values in a file", yaml_tree.MAX_NODES),
+        ("nesting in YAML", yaml_tree.MAX_DEPTH),
+        ("characters in a rule", parse.MAX_LENGTH),
+        ("nesting in a rule", parse.MAX_DEPTH),
         ("characters in a name", MAX_NAME),
-        ("elements of a ruleset", 256),
-        ("distance of a neighbor, in cells", MAX_OFFSET),
-        ("radius of a kernel, in cells", MAX_RADIUS),
-        ("rows of a kernel, and weights of a row", 2 * MAX_RADIUS + 1),
-        ("size of a number", MAX_MAGNITUDE),
+        ("elements", 256),
+        ("distance of a neighbor", MAX_OFFSET),
+        ("radius of a kernel", MAX_RADIUS),
+        ("magnitude of a number", MAX_MAGNITUDE),
         ("modulus of `mod`", 64),
-        ("rounds of `repeat`, or of one variable's range", 64),
-        ("rounds of one loop over several variables", MAX_ROUNDS),
-        ("sets that are defined by each other, in a row", MAX_SET_DEPTH),
-        ("rulesets that extend each other, in a row", MAX_BASES),
-        ("passes of a ruleset", MAX_PASSES),
+        ("rounds of `repeat` or a loop variable", 64),
+        ("rounds of a loop over several variables", MAX_ROUNDS),
+        ("nesting of sets", MAX_SET_DEPTH),
+        ("nesting of `extends`", MAX_BASES),
+        ("passes", MAX_PASSES),
         ("substeps of a pass", MAX_MOMENTS),
-        ("rules of a ruleset, loops unrolled", MAX_RULES),
-        ("side of a world in a test", MAX_SIDE),
+        ("rules, after unrolling loops", MAX_RULES),
+        ("rows or columns of a test", MAX_SIDE),
     ]
-    return table(("what", "at most"), [(what, f"{most:,}") for what, most in rows])
+    return table(("quantity", "maximum"), [(what, f"{most:,}") for what, most in rows])
 
 
 def shipped(rulesets: bool = False) -> str:
@@ -318,12 +283,8 @@ def mutation_testing() -> str:
 TABLES: dict[str, Callable[[], str]] = {
     "mutation operators": mutation_operators,
     "mutation testing": mutation_testing,
-    "directions": directions,
-    "direction sets": direction_sets,
-    "kernels": kernels,
     "functions": functions,
     "kinds": kinds,
-    "words": words,
     "limits": limits,
     "shipped packs": shipped,
     "shipped rulesets": partial(shipped, rulesets=True),

@@ -306,9 +306,9 @@ def generate() -> Any:
 def test_tables_are_fresh(generate: Any) -> None:
     stale = [page_name(page) for page in generate.stale_pages()]
     assert stale == [], "run `python docs/generate.py`"
-    page = "a\n<!-- generated: kernels -->\nold\n<!-- end -->\nb\n"
+    page = "a\n<!-- generated: kinds -->\nold\n<!-- end -->\nb\n"
     fresh = generate.generated(page)
-    assert "`box`" in fresh
+    assert "`flag`" in fresh
     assert "old" not in fresh
     assert generate.generated(fresh) == fresh
 

@@ -70,7 +70,7 @@ class PropertyDecl(Definition, noun="a property", others="an element"):
 class TintDecl(Entry, noun="a tint"):
     """The tint that a field gives cells in pictures, as written."""
 
-    color: str = keyed('the color that cells are tinted toward: "#RRGGBB"', MISSING, name="to", form=COLOR)
+    color: str = keyed("the color that cells are tinted toward", MISSING, name="to", form=COLOR)
     full: int = keyed("the length of the vector at full tint", MISSING, bounds=(1, 1000))
     most: Syntax | None = keyed("the maximum share of the color; `100%` by default")
 
@@ -110,15 +110,15 @@ class RampDecl(Entry, noun="a color_by"):
     start: str | None = keyed(
         "the color at the low end; the element's own by default", name="from", form=COLOR
     )
-    end: str = keyed('the color at the high end: "#RRGGBB"', MISSING, name="to", form=COLOR)
-    over: Syntax | None = keyed("the range LOW..HIGH; the field's by default")
+    end: str = keyed("the color at the high end", MISSING, name="to", form=COLOR)
+    over: Syntax | None = keyed("the range `LOW..HIGH`; the field's by default")
 
 
 class ElementDecl(Definition, noun="an element", others="a property or field"):
     id: Scalar | None = keyed("the preferred id; a free one by default", bounds=(0, 255), shape="number")
     color: str = keyed('its color in quotes: "#RRGGBB"', "#000000", required=True, form=COLOR)
     ramp: RampDecl | None = keyed("how its color depends on a field", name="color_by")
-    glyph: str = keyed("its character in ASCII drawings; a letter of its name by default", "", form=GLYPH)
+    glyph: str = keyed("its character in drawings; a letter of its name by default", "", form=GLYPH)
     about: str = keyed("a one-sentence description", "")
     tags: Words = keyed("its tags", ())
     override: bool = keyed("`yes` replaces an element of another pack", False)
@@ -133,7 +133,7 @@ class AlsoDecl(Definition, others="a property or field"):
     """Tags, values, a color and a ramp that a pack adds to an element of another pack, or a ruleset to one of its packs'."""
 
     tags: Words = keyed("tags to add", (), short=True)
-    color: str | None = keyed('another color in quotes: "#RRGGBB"', form=COLOR)
+    color: str | None = keyed("another color", form=COLOR)
     ramp: RampDecl | None = keyed("how its color depends on a field", name="color_by")
 
 
@@ -143,7 +143,7 @@ class KernelDecl(Definition, noun="a kernel"):
     )
     shape: Syntax | None = keyed("a shape with its radius instead: `disc(3)`")
     edges: str | None = keyed(
-        "whether counting stops at the edges of the grid, which is the default, or wraps",
+        "what lies outside the grid; `nothing` by default",
         choices=("nothing", "wrap"),
     )
 
@@ -235,7 +235,7 @@ class PackDecl(Record, noun="a pack"):
 
     name: Scalar = keyed("the pack's name", MISSING, name="pack")
     source: Source
-    about: str = keyed("a one-sentence description", "")
+    about: str = keyed("a description; most entries can have one", "")
     needs: Words = keyed("packs to load with this one", ())
     provides: Words = keyed("packs that it can replace where others need them", ())
     conflicts: Words = keyed("packs that must not be loaded with this one", ())
@@ -244,9 +244,7 @@ class PackDecl(Record, noun="a pack"):
     fields: tuple[FieldDecl, ...] = keyed("state of cells", ())
     streams: tuple[StreamDecl, ...] = keyed("shared sources of random numbers", (), shape="any")
     params: tuple[ParamDecl, ...] = keyed("numbers that users can override", ())
-    side_multiple: int = keyed(
-        "a divisor of the numbers of rows and columns of all worlds", 1, bounds=(1, MAX_SIDE_MULTIPLE)
-    )
+    side_multiple: int = keyed("a divisor of the sides of all worlds", 1, bounds=(1, MAX_SIDE_MULTIPLE))
     kernels: tuple[KernelDecl, ...] = keyed("neighborhoods for `count` and `sum`", ())
     sets: tuple[SetDecl, ...] = keyed("names for sets of elements", ())
     elements: tuple[ElementDecl, ...] = keyed("the pack's elements", ())
