@@ -172,26 +172,23 @@ def scene_statements() -> str:
 
 
 def tasks(families: bool = False) -> str:
-    """The tasks that come with powderdsl, in families or not: what may be placed, how often, and their knobs."""
+    """The tasks that come with powderdsl, in families or not: the goal, the choices and the number of actions."""
     from powderdsl.tasks.shipped import load_task, shipped_tasks
     from powderdsl.tasks.task import BLOW, NO_CHANGE
 
-    loaded = sorted(((name, load_task(name)) for name in shipped_tasks()), key=lambda one: one[1].family)
+    loaded = sorted(((name, load_task(name)) for name in shipped_tasks()), key=lambda named: named[1].family)
     rows = []
     for name, task in loaded:
         if bool(task.family) != families:
             continue
         names = {element.id: element.name for element in task.ruleset.elements}
         every = set(names) <= set(task.agent.choices)
-        words = ["any"] if every else [names[one] for one in task.agent.choices if one >= 0]
+        words = ["any"] if every else [names[choice] for choice in task.agent.choices if choice >= 0]
         words += ["blow"] if BLOW in task.agent.choices else []
         words += ["nothing"] if NO_CHANGE in task.agent.choices else []
-        knobs = ", ".join(f"`{knob.name}`" for knob in task.knobs)
-        splits = ", ".join(f"`{split.name}`" for split in task.splits)
-        last = task.family if families else splits
-        rows.append((f"`{name}`", task.about, ", ".join(words), str(task.agent.actions), knobs, last))
-    head = "family" if families else "splits"
-    return table(("task", "what is to be done", "with", "actions", "knobs", head), rows)
+        family = (task.family,) if families else ()
+        rows.append((f"`{name}`", task.about, ", ".join(words), str(task.agent.actions), *family))
+    return table(("task", "goal", "choices", "actions", *(["family"] if families else [])), rows)
 
 
 def stages() -> str:

@@ -346,7 +346,18 @@ def frames_of(path: Path) -> list[bytes]:
 def test_every_table_of_keys_is_shown(generate: Any) -> None:
     """A new kind of mapping, or a function, cannot stay undocumented."""
     shown = {found for page in PAGES for found in re.findall(r"<!-- generated: ([\w ]+) -->", read(page))}
-    described = {"axis", "measure", "scratch", "set", "study", "tag"}  # in words, or as a whole file
+    described = {
+        "axis",
+        "end",
+        "expert",
+        "measure",
+        "scratch",
+        "set",
+        "stamp",
+        "stand",
+        "study",
+        "tag",
+    }  # in words, or as a whole file
     bases = {"block", "laws", "variant"}  # their keys are those of a pass, of splits and stands, of tasks
     assert generate.TABLES.keys() - shown == {f"keys {name}" for name in described | bases}
 

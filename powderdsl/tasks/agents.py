@@ -37,20 +37,18 @@ SPEED = Form(
 
 class AgentDecl(Entry, noun="an agent"):
     may: tuple[Scalar, ...] = keyed("elements it may place, `any`, `blow`, `nothing`", (), required=True)
-    speed: Scalar | None = keyed("a number other than 0: the speed that blowing gives to cells")
-    speed_field: Scalar | None = keyed(
-        "the field that blowing sets; the ruleset's only vector, if it has one"
-    )
-    brush: Node | None = keyed("cells that an action changes: a number, or [rows, columns]; 10 by default")
-    bins: Node | None = keyed("places that it can act at: a number, or [rows, columns]; 16 by default")
-    actions: int = keyed("how many actions an episode has", 1, required=True, bounds=(1, MAX_ACTIONS))
-    steps_per_action: int = keyed("steps after each action; 1 by default", 1, bounds=(0, MAX_STEPS))
-    free_steps: int = keyed("steps after the last action, besides; 0 by default", 0, bounds=(0, MAX_STEPS))
+    speed: Scalar | None = keyed("speed that blowing sets, not 0")
+    speed_field: Scalar | None = keyed("field that blowing sets; by default the only vector field")
+    brush: Node | None = keyed("size of a changed block, or [rows, columns]; 10 by default")
+    bins: Node | None = keyed("number of positions, or [rows, columns]; 16 by default")
+    actions: int = keyed("actions in an episode", 1, required=True, bounds=(1, MAX_ACTIONS))
+    steps_per_action: int = keyed("steps after each action", 1, bounds=(0, MAX_STEPS))
+    free_steps: int = keyed("additional steps after the last action", 0, bounds=(0, MAX_STEPS))
 
 
 class ExpertDecl(Record, noun="an expert"):
     search: int = keyed(
-        "random plans that are simulated in each world; the best one is played",
+        "number of random plans to simulate; the best is played",
         1,
         required=True,
         bounds=(1, MAX_PLANS),
@@ -58,18 +56,12 @@ class ExpertDecl(Record, noun="an expert"):
 
 
 class MoveDecl(Record, noun="a move"):
-    choose: Scalar | None = keyed("what it does: an element, `blow` or `nothing`", required=True)
-    toward: Scalar | None = keyed(
-        "where it blows: `left`, `right`, `above`, `below`, or both as `above.right`"
-    )
-    at: Node | None = keyed("where: `[row, column]`, or `most(CELLS)`, the block with most of these cells")
-    within: Scalar | None = keyed("a shape, in one line: only its cells count for `most`")
-    least: int | None = keyed(
-        "how many cells `most` must find for the move to apply; 1 by default", bounds=(1, MAX_SIDE * MAX_SIDE)
-    )
-    condition: Syntax | None = keyed(
-        "when: a condition; the first move whose condition holds is played", name="if"
-    )
+    choose: Scalar | None = keyed("an element, `blow` or `nothing`", required=True)
+    toward: Scalar | None = keyed("direction of blowing, such as `left` or `above.right`")
+    at: Node | None = keyed("`[row, column]`, or `most(CELLS)`: the block with most such cells")
+    within: Scalar | None = keyed("a shape that limits `most`")
+    least: int | None = keyed("cells that `most` must find; 1 by default", bounds=(1, MAX_SIDE * MAX_SIDE))
+    condition: Syntax | None = keyed("condition of the move", name="if")
 
 
 def read_agent(reader: Reader, decl: AgentDecl, rules: Ruleset, size: Size) -> Agent:

@@ -373,13 +373,11 @@ def element_ids(word: Written, ruleset: Ruleset, reporter: Reporter) -> tuple[in
 
 
 class StampDecl(Entry, noun="a stamp"):
-    art: yaml_tree.Scalar | None = keyed("ASCII art; `?` leaves a cell as it is", shape="text")
+    art: yaml_tree.Scalar | None = keyed("ASCII art; `?` leaves a cell unchanged", shape="text")
     legend: tuple[tuple[yaml_tree.Scalar, yaml_tree.Scalar], ...] = keyed(
-        "what the characters mean, where glyphs will not do", (), maps="characters to elements"
+        "characters and their elements, where glyphs do not suffice", (), maps="characters to elements"
     )
-    scene: yaml_tree.Scalar | None = keyed(
-        "instead of art: a shipped scene, or a world's file beside the task's"
-    )
+    scene: yaml_tree.Scalar | None = keyed("instead of art: a shipped scene, or a file in the task's folder")
 
 
 def read_stamp(decl: StampDecl, reader: Reader, ruleset: Ruleset) -> Stamp:

@@ -44,35 +44,31 @@ from powderdsl.worlds.scene.statements import Statement, Written, number, read_a
 
 
 class KnobDecl(Entry, noun="a knob"):
-    default: Scalar | None = keyed(
-        "its value unless another is set; it may depend on knobs above it", required=True, shape="line"
-    )
-    range: Scalar | None = keyed("the values it may have: `LOW..HIGH`", required=True, shape="line")
-    about: str = keyed("what it does, in a sentence", "")
+    default: Scalar | None = keyed("default value; may use knobs above it", required=True, shape="line")
+    range: Scalar | None = keyed("allowed values: `LOW..HIGH`", required=True, shape="line")
+    about: str = keyed("its effect, in a sentence", "")
 
 
 class RewardDecl(Record, noun="a reward"):
     each: Syntax | None = keyed("given after every action")
-    final: Syntax | None = keyed("given with the last action, after the free steps")
-    shaped: Syntax | None = keyed("given after every action in place of both, where training asks for it")
+    final: Syntax | None = keyed("given once, after the free steps")
+    shaped: Syntax | None = keyed("replaces both during training, if requested")
 
 
 class EndDecl(Record, noun="an end"):
-    success: Syntax | None = keyed("the episode ends, and the task is done")
-    failure: Syntax | None = keyed("the episode ends, and the task is not done")
+    success: Syntax | None = keyed("ends the episode as solved")
+    failure: Syntax | None = keyed("ends the episode as failed")
 
 
 class Laws(Record):
     """The rules that worlds run under."""
 
     params: tuple[tuple[Scalar, Scalar], ...] = keyed(
-        "other values for the rules' parameters; of a range, such as `1%..20%`, each world draws its own",
+        "parameter values; each world draws from a range such as `1%..20%`",
         (),
         maps="parameters to values or ranges",
     )
-    rulesets: tuple[Scalar, ...] = keyed(
-        "rules in place of `rules`; world after world takes the next. `universe:0..63` are 64 of them", ()
-    )
+    rulesets: tuple[Scalar, ...] = keyed("rules that worlds use in turn; `universe:0..63` stands for 64", ())
 
 
 class Variant(Record):
@@ -81,48 +77,40 @@ class Variant(Record):
     knobs: Node | None = keyed("other values for knobs", shape="mapping")
     let: Node | None = keyed("other values or ranges for names of `let`", shape="mapping")
     parts: Node | None = keyed("other statements for parts", shape="mapping")
-    generate: Node | None = keyed("other statements altogether")
+    generate: Node | None = keyed("statements that replace the task's")
 
 
 class StandDecl(Variant, noun="a stand"):
     stand: Scalar | None = keyed("its name", required=True)
-    about: str = keyed("what it shows, in a sentence", "")
+    about: str = keyed("its purpose, in a sentence", "")
 
 
 class SplitDecl(Variant, Laws, Entry, noun="a split"):
-    about: str = keyed("what it is for, in a sentence", "")
-    stands: Node | None = keyed(
-        "fixed worlds: a list of such changes, each with a name under `stand`", shape="list"
-    )
+    about: str = keyed("its purpose, in a sentence", "")
+    stands: Node | None = keyed("fixed worlds: a list of changes, each named by `stand`", shape="list")
 
 
 class TaskDecl(Laws, noun="a task"):
     """A task's file as written."""
 
     name: str = keyed("the task's name", "", name="task", required=True, form=NAME_FORM)
-    about: str = keyed("what is to be done, in a sentence", "")
-    family: str = keyed("what tasks of its kind have in common, such as `build` or `herd`", "", shape="word")
-    rules: Scalar | None = keyed(
-        "the rules of its worlds: a shipped ruleset, packs joined by `+`, or a file", required=True
-    )
+    about: str = keyed("the goal, in a sentence", "")
+    family: str = keyed("a group of similar tasks, such as `build`", "", shape="word")
+    rules: Scalar | None = keyed("a shipped ruleset, packs joined by `+`, or a file", required=True)
     size: Node | None = keyed("[rows, columns]", required=True)
-    fill: Scalar | None = keyed("the element that is everywhere before anything is drawn", required=True)
-    knobs: tuple[KnobDecl, ...] = keyed("integers that are set from outside", ())
-    let: Node | None = keyed("numbers and draws that statements and regions share, in order", shape="mapping")
-    regions: Node | None = keyed(
-        "names for sets of cells: a shape each, or a list of shapes", shape="mapping"
-    )
-    stamps: tuple[StampDecl, ...] = keyed("pictures that statements paint", ())
-    parts: Node | None = keyed("lists of statements with a name", shape="mapping")
-    targets: Node | None = keyed(
-        "pictures that rewards compare worlds with: lists of statements", shape="mapping"
-    )
-    generate: Node | None = keyed("statements, later ones over earlier ones")
-    agent: AgentDecl | None = keyed("what an agent may do, and for how long", required=True)
-    reward: RewardDecl | None = keyed("what counts: `each`, `final`, or both; and `shaped`, for training")
-    end: EndDecl | None = keyed("conditions that end an episode: `success`, `failure`")
-    expert: Node | None = keyed("how a good player acts: a list of moves, or `search: N`")
-    splits: tuple[SplitDecl, ...] = keyed("other sets of worlds beside `train`", ())
+    fill: Scalar | None = keyed("the element that fills the world first", required=True)
+    knobs: tuple[KnobDecl, ...] = keyed("integers that users may set", ())
+    let: Node | None = keyed("numbers and draws shared by statements and regions", shape="mapping")
+    regions: Node | None = keyed("names for shapes, or for lists of shapes", shape="mapping")
+    stamps: tuple[StampDecl, ...] = keyed("pictures to paint", ())
+    parts: Node | None = keyed("named lists of statements", shape="mapping")
+    targets: Node | None = keyed("pictures that rewards compare worlds with", shape="mapping")
+    generate: Node | None = keyed("statements that draw the start world")
+    agent: AgentDecl | None = keyed("what an agent may do, and how often", required=True)
+    reward: RewardDecl | None = keyed("`each`, `final` and `shaped`")
+    end: EndDecl | None = keyed("`success` and `failure`")
+    expert: Node | None = keyed("a list of moves, or `search: N`")
+    splits: tuple[SplitDecl, ...] = keyed("other sets of worlds, in addition to `train`", ())
 
 
 RANGE = ".."
