@@ -159,6 +159,31 @@ def find_changes(ruleset: Ruleset, facts: Facts, *, together: bool = True) -> li
     return list(effects_of.values())
 
 
+def may_rise_and_fall(ruleset: Ruleset, facts: Facts, number: int) -> tuple[bool, bool]:
+    """Whether some rule may turn other elements into an element, and this one into others: less work than `find_changes`."""
+    rises = falls = False
+    for _, moment in substeps(ruleset.passes):
+        search = SubstepSearch(moment, facts, moment.values)
+        for rule in moment.rules:
+            if isinstance(rule, Transform):
+                same = member(rule.target, (number,))
+                rises = rises or search.may(rule, element_is_not(number), (same, HERE))
+                falls = falls or search.may(rule, element_is(number), (negation(same), HERE))
+            elif isinstance(rule, Move):
+                lost = search.may(rule, element_is(number, rule.offset))
+                other = search.may(rule, element_is_not(number, rule.offset))
+                mixed, left = lost and other, rule.leaving and rule.leaving.value
+                rises |= mixed if left is None else left == number and other
+                falls |= mixed if left is None else left != number and lost
+        if not (rises and falls):
+            pairs = _joint_effects(search)[1]
+            rises |= any(after == number for _, after in pairs)
+            falls |= any(before == number for before, _ in pairs)
+        if rises and falls:
+            break
+    return rises, falls
+
+
 def line_effects(ruleset: Ruleset) -> list[LineEffects]:
     """Effects of each line by itself."""
     return find_changes(ruleset, facts_of(ruleset), together=False)

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from powderdsl.analysis.ledger import trend_text
 from powderdsl.compiler import load_with_diagnostics, read, shipped_rules
 from powderdsl.diagnostics import CompileError, Diagnostic, Reporter, Source, Span
 from powderdsl.editing.cursor import Cursor, cursor_at, keys_at, values_at
@@ -255,6 +256,7 @@ def _described(word: Word, model: Ruleset | None) -> str:
     lines = [title + (f": {word.about}" if word.about else "")]
     elements = model.elements if model else ()
     element = next((element for element in elements if element.name == word.name), None)
-    if element is not None and word.kind == "element":
+    if model is not None and element is not None and word.kind == "element":
         lines.append(f"id {element.id}, color {element.color}")
+        lines += filter(None, [trend_text(model, element.id)])
     return "\n\n".join(lines)

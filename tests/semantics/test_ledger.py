@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from powderdsl.analysis.ledger import Ledger, NotProven, Proven, ledger, ledger_text
+from powderdsl.analysis.ledger import Ledger, NotProven, Proven, ledger, ledger_text, trend_text
 from powderdsl.compiler import load
 from powderdsl.model.state import slots
 from powderdsl.model.types import ELEMENT, Ruleset
@@ -52,6 +52,14 @@ def small(rules: str) -> Ruleset:
 @pytest.mark.golden
 def test_the_ledger_of_powderworld(golden: Callable[[Path, str], None]) -> None:
     golden(GOLDEN / "powderworld.ledger", ledger_text(ledger(load("powderworld"))))
+
+
+@pytest.mark.parametrize("name", ["margolus", "powderworld"])
+def test_editors_show_what_the_ledger_says_of_an_element(name: str) -> None:
+    rules = load(name)
+    text = ledger_text(ledger(rules, needs=False))
+    for element in rules.elements:
+        assert f"\n{element.name}: {trend_text(rules, element.id)}\n" in text
 
 
 def test_what_rules_need_may_be_left_out() -> None:
