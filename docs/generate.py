@@ -59,7 +59,7 @@ SHAPES = {
     "lines": "expressions",
     "line": "expression",
     "block": "block",
-    "invariants": "invariants",
+    "invariants": "list",
     "any": "see below",
 }
 """Shapes of `schema.Key`, as readers see them."""

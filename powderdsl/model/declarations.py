@@ -251,7 +251,7 @@ class PackDecl(Record, noun="a pack"):
     also: tuple[AlsoDecl, ...] = keyed("tags, values and colors for elements of other packs", ())
     passes: tuple[PassDecl, ...] = keyed("what happens in a step", ())
     invariants: tuple[Syntax, ...] = keyed("statements that hold in every world", (), shape="invariants")
-    tests: tuple[TestDecl, ...] = keyed("small worlds and what becomes of them", (), shape="list")
+    tests: tuple[TestDecl, ...] = keyed("small worlds and expected results", (), shape="list")
 
     @property
     def entries(self) -> tuple[ElementDecl | AlsoDecl, ...]:
