@@ -311,3 +311,9 @@ def test_no_statement_ends_in_anything_but_a_diagnostic(text):
     assert (found is None) == reporter.has_errors
     str(CompileError(reporter.diagnostics))
     read_scenes(Source("fuzz", f"{HEAD}  - {text}\n"), Reporter())
+
+
+def test_the_garden_is_alive_after_two_minutes():
+    sim = powderdsl.compile(powderdsl.load("powderworld"))
+    before = sim.step(powderdsl.load_world("garden", sim, batch=4), 7200)
+    assert (sim.step(before, 60).ids != before.ids).sum((1, 2)).min() > 20
