@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from powderdsl.arrays import np
-from powderdsl.compiler import load_with_diagnostics, read
+from powderdsl.compiler import load, load_with_diagnostics, read
 from powderdsl.diagnostics import CompileError, Reporter, Source
 from powderdsl.diagnostics.diagnostic import diagnostic_data, render_text
 from powderdsl.editing.layout import formatted
@@ -27,6 +27,8 @@ from powderdsl.model.types import Ruleset
 from powderdsl.simulation.standalone import standalone_module
 from powderdsl.syntax.sources import shipped
 from powderdsl.system.cache import Memo
+from powderdsl.universes import PREFIX
+from powderdsl.worlds.strewn import frame_element
 
 MAX_FILES = 64
 MAX_TEXT = 1 << 20
@@ -142,6 +144,20 @@ class Session:
         if self.ruleset is None:
             raise BadRequest("no rules without mistakes have been loaded")
         return self.ruleset
+
+    def universe(self, seed: str) -> dict[str, Any]:
+        """The rules of `powderdsl universe SEED`, as the site has its own rules."""
+        name = f"{PREFIX}{seed}"
+        ruleset, sources = load(name), [pack.source for pack in read([name], Reporter())[0]]
+        files = {f"{Path(source.name).stem.replace(':', '_')}.yaml": source.text for source in sources}
+        return {
+            "title": ruleset.name,
+            "about": f"Universe {seed}: invented elements under laws that nobody has seen.",
+            "files": files,
+            "off": [],
+            "frame": frame_element(ruleset, ruleset.elements[0].id),
+            "worlds": [],
+        }
 
     def command(self) -> dict[str, Any]:
         """The arguments of the command line for the last good rules: `rules` for `run`, and `files` to save first.

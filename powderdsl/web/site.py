@@ -42,7 +42,7 @@ from powderdsl.system.writing import replacing
 from powderdsl.targets.array_kind import ArrayKind
 from powderdsl.tasks.shipped import load_task, shipped_tasks
 from powderdsl.tasks.tensors.generator import StartWorlds
-from powderdsl.universes import is_universe
+from powderdsl.universes import MAX_SEED, is_universe
 from powderdsl.worlds.raster import Size, mask
 from powderdsl.worlds.scene import draw_start, shipped_scenes
 from powderdsl.worlds.store import world_data
@@ -248,6 +248,7 @@ class Site:
                     makers[prefix + path.relative_to(folder).as_posix()] = path.read_bytes
         makers["index.html"], makers["python.zip"] = index_page, python_archive
         makers["licenses.txt"] = licenses
+        makers["language.txt"] = (examples_folder().parent / "short.md").read_bytes
         worker, landing = makers.pop("sw.js"), makers.pop("landing.html")
         makers |= shipped_files()
         if self.first is not None and not (self.first.is_shipped and self.start in makers):
@@ -388,7 +389,7 @@ def index_page() -> bytes:
     text = (PAGE / "index.html").read_text(encoding="utf-8")
     inline = text.partition('<script type="importmap">')[2].partition("</script>")[0]
     digest = base64.b64encode(hashlib.sha256(inline.encode()).digest()).decode()
-    return text.replace("IMPORTMAP", digest).encode()
+    return text.replace("IMPORTMAP", digest).replace("UNIVERSES", str(MAX_SEED)).encode()
 
 
 def _dump(value: Any) -> bytes:

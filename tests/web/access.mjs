@@ -16,6 +16,7 @@ const problems = [];
 async function open(options, path = "play.html") {
   const context = await browser.newContext({ bypassCSP: true, ...options });
   const page = await context.newPage();
+  await page.addInitScript(() => localStorage.setItem("toured", "yes"));
   page.on("pageerror", (error) => problems.push(String(error)));
   await page.goto(address + path);
   if (path.startsWith("play")) await page.waitForFunction(() => globalThis.powderdsl?.linkOpened && powderdsl.firstPicture, null, { timeout: 60_000 });

@@ -20,8 +20,9 @@ export async function launch() {
 }
 
 /** `before` is run in the page before its own scripts. */
-export async function openPage(browser, address, { before, ...options } = {}) {
+export async function openPage(browser, address, { before, tour = false, ...options } = {}) {
   const page = await browser.newPage({ viewport: { width: 1440, height: 900 }, ...options });
+  if (!tour) await page.addInitScript(() => localStorage.setItem("toured", "yes"));
   if (before) await page.addInitScript(before);
   const problems = [];
   page.on("console", (message) => {
@@ -77,11 +78,14 @@ export function tools(page) {
   return { text, until, ready, said, settled, state, count, choose, edit, applied, files, paint };
 }
 
-/** Replaces a text in the editor. */
+/** Replaces a text in the shown file, or in the first one that has it. */
 export const replaceText = (page, from, to) =>
   page.evaluate(
-    ([old, fresh]) => {
-      const { view } = powderdsl.edits.editor;
+    async ([old, fresh]) => {
+      const { files, shown, editor: { view } } = powderdsl.edits;
+      const { goTo } = await import("./rules.js");
+      const file = files[shown].includes(old) ? shown : Object.keys(files).find((name) => files[name].includes(old));
+      if (file !== shown) goTo(file, 1, 1);
       const at = view.state.doc.toString().indexOf(old);
       if (at < 0) throw new Error(`${old} is not in the file`);
       view.dispatch({ changes: { from: at, to: at + old.length, insert: fresh } });

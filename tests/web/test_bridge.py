@@ -14,6 +14,7 @@ import pytest
 import wasmtime
 
 import powderdsl
+from powderdsl.universes import universe_text
 from powderdsl.web import bridge
 from powderdsl.web.site import Entry, shipped_entries
 from powderdsl.worlds.store import load_world, world_data
@@ -222,3 +223,12 @@ def test_what_does_not_fit_is_an_error_message() -> None:
 def test_every_ruleset_of_the_site_opens(session: bridge.Session) -> None:
     for entry in shipped_entries():
         assert call("check", entry.files(), entry.off)["result"]["ok"], entry.key
+
+
+def test_a_universe_is_that_of_the_command_line(session: bridge.Session) -> None:
+    found = call("universe", "7")["result"]
+    assert found["files"] == {**files("core"), "universe_7.yaml": universe_text(7)}
+    assert found["frame"] == 1
+    assert call("check", found["files"], [])["result"]["ok"]
+    assert "no universe `99999999999`" in call("universe", "99999999999")["error"]
+    assert "no universe `../core`" in call("universe", "../core")["error"]

@@ -13,6 +13,7 @@ from typing import Any
 
 import pytest
 
+from powderdsl.universes import universe_text
 from powderdsl.web import site as site_module
 from powderdsl.web.site import Entry, Site
 from tests.web.test_page import HERE, needed
@@ -151,3 +152,46 @@ def test_two_fingers_zoom_and_do_not_paint(felt: dict[str, Any]) -> None:
 def test_worlds_can_be_dark_and_still(felt: dict[str, Any]) -> None:
     assert felt["dark"]["ground"] < 100 <= felt["dark"]["least"]
     assert felt["still"] == [False, 0]
+
+
+@pytest.fixture(scope="module")
+def first(folder: Path) -> dict[str, Any]:
+    return saw("first.mjs", folder)
+
+
+def test_a_first_visit_shows_three_steps(first: dict[str, Any]) -> None:
+    assert [words.split("\n")[0] for words in first["steps"]] == [
+        "1. Paint",
+        "2. Change this line",
+        "3. Share",
+    ]
+    assert "ice -> water" in first["steps"][1]
+    assert (first["focused"], first["ended"]) == (True, True)
+    assert first["later"] == [False, False, True]
+    assert (first["sheet"], first["escaped"]) == (False, [True, "yes"])
+    assert first["docs"] == "# The rule language in brief"
+
+
+def test_the_editor_opens_on_a_rule_and_elements_lead_to_theirs(first: dict[str, Any]) -> None:
+    assert first["rule"][0] == "water.yaml"
+    assert "ice -> water" in first["rule"][1]
+    assert first["mentions"][0].startswith("water.yaml:8 ice: {")
+    assert any(words.startswith("fire.yaml:") for words in first["mentions"])
+    assert (first["mentioned"][0], "water -> ice" in first["mentioned"][1]) == ("water.yaml", True)
+
+
+def test_a_form_writes_the_pack_of_a_new_element(first: dict[str, Any]) -> None:
+    assert first["taken"] == "There is a sand already."
+    shown, text, element, mistakes = first["written"]
+    assert (shown, element, mistakes) == ("goo.yaml", "goo.goo", 0)
+    assert "- goo -> empty if count(sand) > 0 with chance 20%\n" in text
+    assert "- sand -> water if count(goo) > 0 with chance 20%\n" in text
+
+
+def test_a_universe_opens_by_its_seed(first: dict[str, Any]) -> None:
+    found = first["universe"]
+    assert (found["key"], found["hash"], found["menu"]) == ("universe_7", "#universe=7", "universe_7")
+    assert found["text"] == universe_text(7)
+    assert (first["back"], "world of the link" in first["linked"]) == ("universe_7", True)
+    assert "universe" in first["refused"]
+    assert first["problems"] == []

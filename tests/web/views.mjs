@@ -1,7 +1,7 @@
 // Looks at an exported site as visitors do: node views.mjs ADDRESS FOLDER
 // Pictures and downloads go to FOLDER; what was seen is printed as JSON.
 import { join } from "node:path";
-import { launch, openPage } from "./browser.mjs";
+import { launch, openPage, replaceText } from "./browser.mjs";
 
 const [address, folder] = process.argv.slice(2);
 const browser = await launch();
@@ -84,12 +84,8 @@ const said = (id, pattern) =>
   page.waitForFunction(([one, source]) => new RegExp(source).test(document.getElementById(one).textContent), [id, pattern.source], { timeout: 60_000 });
 await page.waitForFunction(() => powderdsl.compilerReady, null, { timeout: 60_000 });
 await said("problems", /No mistakes/);
-const ruled = await page.evaluate(() => {
-  const { view } = powderdsl.edits.editor;
-  const at = view.state.doc.toString().indexOf("density: 4");
-  view.dispatch({ changes: { from: at, to: at + 10, insert: "density: 2" } });
-  return Number(powderdsl.engine.clock()[2]);
-});
+const ruled = await page.evaluate(() => Number(powderdsl.engine.clock()[2]));
+await replaceText(page, "density: 4", "density: 2");
 await said("status", /The new rules run/);
 await page.waitForFunction((step) => powderdsl.engine.clock()[2] > step + 30, ruled);
 const chart = await page.locator("#chart").boundingBox();

@@ -84,6 +84,15 @@ async function renew() {
   await new Promise(() => {});
 }
 
+/** Whether this browser has shown the first steps. */
+function toured() {
+  try {
+    return localStorage.getItem("toured") !== null;
+  } catch {
+    return true; // it keeps nothing
+  }
+}
+
 async function begin() {
   await renew().catch(() => {}); // frames may be refused
   const full = new URL(location.href);
@@ -110,11 +119,12 @@ async function begin() {
     const { fromFragment } = await import("./share.js");
     const shared = await fromFragment(location.hash);
     if (shared?.files === null) await openWork(shared, { run: !isStill() });
-    if (!shared?.files) return;
+    if (!shared?.files && !location.hash.startsWith("#universe=")) return;
   }
   await import("./compiler.js"); // its worker loads beside the editor
   await Promise.all([import("./panels.js"), import("./rules.js")]);
-  await Promise.all([import("./exchange.js"), import("./checks.js")]);
+  await Promise.all([import("./exchange.js"), import("./checks.js"), import("./elements.js")]);
+  if (!embedded && !app.isBack && !location.hash && !toured()) await import("./tour.js");
   await addWorlds(await (await get("tasks.json")).json());
   if (app.catalog.offline) navigator.serviceWorker?.register("sw.js").catch(() => {}); // private windows may refuse
 }

@@ -109,7 +109,7 @@ class Compiler {
 }
 
 /** Reports that people ask for may take longer than a compilation. */
-const LIMITS = { invariants: 60_000, tests: 60_000, trace: 60_000 };
+const LIMITS = { universe: 60_000, invariants: 60_000, tests: 60_000, trace: 60_000 };
 
 /** The compiler of this page: Python begins to load when this module is first imported. */
 export const compiler = new Compiler((stage, error) => {

@@ -200,10 +200,10 @@ export class Editor {
     this.view.dispatch(setDiagnostics(this.view.state, marks));
   }
 
-  goTo(line, column) {
+  goTo(line, column, { focus = true } = {}) {
     const found = this.view.state.doc.line(Math.min(line, this.view.state.doc.lines));
     const at = Math.min(found.from + column - 1, found.to);
     this.view.dispatch({ selection: { anchor: at }, effects: EditorView.scrollIntoView(at, { y: "center" }) });
-    this.view.focus();
+    if (focus) this.view.focus();
   }
 }

@@ -2,11 +2,11 @@
 
 import { $, commandLine, failed, make, say } from "./dom.js";
 import { Recorder, download, gif, png } from "./media.js";
-import { openWork, openWorld } from "./opening.js";
+import { openRules, openWork, openWorld } from "./opening.js";
 import { addFile, addRuleset, isRuleset, rules } from "./rules.js";
 import { MAX_SHARED, fromBytes, fromFragment, rounded, toBytes, toFragment } from "./share.js";
-import { listedRules, sheetOf } from "./shipped.js";
-import { refresh, setRunning } from "./stage.js";
+import { isUniverse, listedRules, sheetOf } from "./shipped.js";
+import { isStill, setRunning } from "./stage.js";
 import { app } from "./state.js";
 import { missing, webm } from "./video.js";
 import { changedParameters } from "./work.js";
@@ -62,6 +62,8 @@ const saveAll = async (shared) => download(new Blob([await toBytes(shared)]), "w
 
 /** Opens what a link holds. */
 export async function openLink(fragment) {
+  const universe = /^#universe=0*(\d{1,10})$/.exec(fragment);
+  if (universe) return openRules(`universe_${universe[1]}`, { run: !isStill() });
   const shared = await fromFragment(fragment);
   if (shared === null) return false;
   const earlier = shared.from.length - 1;
@@ -71,7 +73,7 @@ export async function openLink(fragment) {
 
 async function openShared(shared, words) {
   const { files: changed, key } = shared;
-  if (!listedRules(key)) throw new Error(`It uses the rules ${key}, which this page does not have.`);
+  if (!listedRules(key) && !isUniverse(key)) throw new Error(`It uses the rules ${key}, which this page does not have.`);
   const files = changed && { ...(await sheetOf(key)).files, ...changed };
   for (const name of Object.keys(files ?? {})) if (files[name] === null) delete files[name];
   return openWork({ ...shared, files }, { words });
@@ -184,6 +186,13 @@ missing().then((reason) => {
   $("save-webm").disabled = $("no-video").textContent = reason;
   $("no-video").hidden = !reason;
 });
+/** Opens the universe of a seed at its own address, so that Back leads away from it. */
+$("universe").addEventListener("submit", ({ target }) => {
+  const hash = `#universe=${target.elements.seed.value}`;
+  if (location.hash === hash) openLink(hash).catch(failed);
+  else location.hash = hash;
+});
+for (const one of document.querySelectorAll("dialog [value='']")) one.onclick = () => one.closest("dialog").close();
 on("open", () => $("file").click());
 $("file").onchange = () => {
   openAll([...$("file").files]).catch(failed);

@@ -3,19 +3,21 @@
 import { $, failed, say } from "./dom.js";
 import { Engine, enlarged, framed, scatter, tiled } from "./engine.js";
 import { clearChart } from "./readings.js";
-import { hasModule, listedRules, moduleOf, sheetOf, shippedModule } from "./shipped.js";
+import { hasModule, isUniverse, listedRules, moduleOf, sheetOf, shippedModule, sizesOf, unedited } from "./shipped.js";
 import { refresh, setRunning, use } from "./stage.js";
 import { app } from "./state.js";
-import { isWork, newSitting, newWork, open, remember, showMenus, swap } from "./work.js";
+import { UNIVERSE, isWork, newSitting, newWork, open, remember, showMenus, swap } from "./work.js";
 import { MAX_CLOCK, readWorld } from "./worlds.js";
 
 /** Opens rules of the site. Resolves to whether they are open. */
 export function openRules(key, { size: wanted = "64x64", run = true } = {}) {
   say(`Loading ${key}…`);
   return swap(async () => {
-    const sizes = listedRules(key).sizes;
+    const sizes = sizesOf(key);
     const [rows, columns] = sizes.find((one) => one.join("x") === wanted) ?? sizes[0];
-    const [sheet, module] = await Promise.all([sheetOf(key), shippedModule(key, rows, columns)]);
+    if (hasModule(key, rows, columns)) shippedModule(key, rows, columns).catch(() => {}); // both load at once
+    const sheet = await sheetOf(key);
+    const module = await unedited(sheet, rows, columns);
     const engine = await Engine.start(module);
     return () => {
       // Packs are opened to paint with their own elements, the first of which is the ground in rules of one pack.
@@ -42,7 +44,13 @@ function land(found, engine) {
   return kept ? (app.save ? "Your earlier work is under Recent." : "Undo brings your earlier work back.") : "";
 }
 
-export const chooseRules = (key) => openRules(key, { size: $("size").value }).catch(failed);
+/** Opens rules of the menu. Its last entry asks for the seed of a universe. */
+export function chooseRules(key) {
+  if (key !== UNIVERSE) return openRules(key, { size: $("size").value }).catch(failed);
+  showMenus();
+  $("universe").querySelector("input").value = String(Math.floor(Math.random() * 1e6));
+  return $("universe").showModal();
+}
 
 /** Worlds of tasks, which come after the first world runs. @param {Record<string, any[]>} found  by rules */
 export async function addWorlds(found) {
@@ -143,7 +151,7 @@ export function openWork(found, { words, run = false, work } = {}) {
   const { files, key, off, parameters, world } = found;
   const { rows, columns } = world;
   const opened = swap(async () => {
-    const sheet = listedRules(key) ? await sheetOf(key) : found.sheet;
+    const sheet = listedRules(key) || (isUniverse(key) && !found.sheet) ? await sheetOf(key) : found.sheet;
     if (!sheet) throw new Error(`This page does not have the rules ${key}.`);
     const edited = files !== null || String(off) !== String(sheet.off);
     const own = { files: files ?? sheet.files, off };
@@ -153,7 +161,7 @@ export function openWork(found, { words, run = false, work } = {}) {
     if (!module) say("Compiling the rules…");
     module ??= await (await import("./rules.js")).compile(good, rows, columns);
     // Rules with mistakes and no earlier ones without: those of the site run, until the mistakes are gone.
-    const runs = module ?? (await shippedModule(key, ...listedRules(key).sizes[0]));
+    const runs = module ?? (await unedited(sheet, ...sizesOf(key)[0]));
     const engine = await Engine.start(runs);
     return () => {
       const shown = found.shown ?? Object.keys(files ?? {}).find((name) => files[name] !== sheet.files[name]);

@@ -13,6 +13,18 @@ import { bytesOf, remember, showMenus, swap } from "./work.js";
 const PAUSE = 120; // ms without a key before a check
 export const packOf = (file) => file.replace(/\.ya?ml$/, "");
 export const isRuleset = (text) => /^ruleset:/m.test(text);
+
+/** The lines of a file with their numbers and the key of the top level that they belong to. */
+export function* linesOf(source) {
+  let section = "";
+  for (const [at, text] of source.split("\n").entries()) {
+    section = /^(\w+):/.exec(text)?.[1] ?? section;
+    if (!/^\s*(#|about:|$)/.test(text)) yield { line: at + 1, text, section };
+  }
+}
+
+/** The first rule of a file: something that becomes something else. */
+const firstRule = (text) => [...linesOf(text)].find((one) => one.section === "passes" && one.text.includes(" -> "));
 const declared = (text) => /^pack: *([A-Za-z_]\w{0,60}) *(#.*)?$/m.exec(text)?.[1];
 
 /** Whether the same packs of the same files take part. */
@@ -61,7 +73,9 @@ export function openFiles({ files, off = [], shown, good }) {
   const names = Object.keys(files);
   const own = `${app.rules.key}.yaml`;
   const wanted = shown in files ? shown : names.includes(own) && !isRuleset(files[own]) ? own : null;
-  show(wanted ?? names[2] ?? names.at(-1));
+  show(wanted ?? names.find((name) => !isRuleset(files[name]) && firstRule(files[name])) ?? names.at(-1));
+  const rule = shown in files ? null : firstRule(files[rules.shown]);
+  if (rule) editor.goTo(rule.line, rule.text.indexOf(" -> ") + 5, { focus: false });
   return recheck();
 }
 

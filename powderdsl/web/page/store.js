@@ -2,7 +2,7 @@
 
 import { $, failed, make, say } from "./dom.js";
 import { openWork } from "./opening.js";
-import { sheetOf } from "./shipped.js";
+import { listedRules, sheetOf } from "./shipped.js";
 import { isStill } from "./stage.js";
 import { app } from "./state.js";
 import { SPEEDS, setBrush, setSpeed, setTool } from "./tools.js";
@@ -107,7 +107,7 @@ export async function restore() {
   if (!head && !place() && heads[0]?.isWork && !heads[0].open && heads[0].first === app.catalog.rules[0].key) {
     const { key, sheet } = await answer(read("works").get(heads[0].id));
     // Rules that have changed on the disk are to be seen: earlier work on them is in the list.
-    if (JSON.stringify((await sheetOf(key)).files) === JSON.stringify(sheet.files)) [head] = heads;
+    if (!listedRules(key) || JSON.stringify((await sheetOf(key)).files) === JSON.stringify(sheet.files)) [head] = heads;
   }
   if (!head) return false;
   const { blind, dark, tint, brush, element, running, speed, tool } = head.settings;

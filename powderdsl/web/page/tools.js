@@ -133,6 +133,7 @@ export function choose(element) {
   if (!["brush", "fill"].includes(app.tool)) setTool("brush");
   for (const one of $("elements").children) one.setAttribute("aria-checked", String(one.dataset.element === app.element));
   markStop($("elements"));
+  $("rules-of").textContent = `Rules of ${element.name}`;
 }
 
 export function showElements() {
@@ -145,6 +146,7 @@ export function showElements() {
     return make("button", { ...attributes, onclick: () => choose(one) }, swatch, make("span", {}, one.name));
   });
   $("elements").replaceChildren(...buttons);
+  $("rules-of").textContent = `Rules of ${app.engine.elements.find((one) => one.qualified === app.element).name}`;
   markStop($("elements"));
 }
 

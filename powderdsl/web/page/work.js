@@ -3,7 +3,7 @@
 import { $, failed, fill } from "./dom.js";
 import { Engine } from "./engine.js";
 import { clearChart } from "./readings.js";
-import { listedRules, moduleOf } from "./shipped.js";
+import { listedRules, moduleOf, sizesOf } from "./shipped.js";
 import { refresh, use } from "./stage.js";
 import { app } from "./state.js";
 
@@ -12,6 +12,9 @@ import { app } from "./state.js";
  * storage. `texts` are the files that change, where nothing else does: those are exchanged alone.
  * @typedef {ReturnType<typeof moment> & {texts?: Record<string, string | undefined>}} Moment
  */
+
+/** The entry of the menu of rules that asks for a seed. */
+export const UNIVERSE = "universe…";
 
 let newest = 0;
 
@@ -48,9 +51,10 @@ export function showMenus() {
   const keys = app.catalog.rules.map((one) => one.key);
   const edited = app.edits?.edited ?? app.opened?.edited;
   const label = (key) => (key === rules.key && edited ? `${key} (edited)` : key);
-  fill($("rules"), (listed ? keys : [...keys, rules.key]).map((key) => [key, label(key)]), rules.key);
+  const rows = (listed ? keys : [...keys, rules.key]).map((key) => [key, label(key)]);
+  fill($("rules"), [...rows, [UNIVERSE, UNIVERSE]], rules.key);
   const size = `${engine.rows}x${engine.columns}`;
-  const sizes = new Set([...(listed?.sizes ?? []).map((one) => one.join("x")), size]);
+  const sizes = new Set([...sizesOf(rules.key).map((one) => one.join("x")), size]);
   fill($("size"), [...sizes].map((one) => [one, one.replace("x", "×")]), size);
   const worlds = rules.worlds.map((one) => [one.name, one.name.replace(/^task /, "task: ")]);
   const opened = named.world ? [] : [["", "opened world"]];
