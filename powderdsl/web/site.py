@@ -43,6 +43,7 @@ from powderdsl.targets.array_kind import ArrayKind
 from powderdsl.tasks.shipped import load_task, shipped_tasks
 from powderdsl.tasks.tensors.generator import StartWorlds
 from powderdsl.universes import MAX_SEED, is_universe
+from powderdsl.web.playable import task_data
 from powderdsl.worlds.raster import Size, mask
 from powderdsl.worlds.scene import draw_start, shipped_scenes
 from powderdsl.worlds.store import world_data
@@ -154,6 +155,9 @@ def shipped_files() -> dict[str, Make]:
     """The makers of files about shipped rules: the catalog, start worlds of tasks, sheets and modules."""
     rows = _shipped_rows()
     makers: dict[str, Make] = {"tasks.json": partial(cached, "tasks.json", lambda: _dump(task_worlds()))}
+    for name in json.loads((PAGE / "scores.json").read_text(encoding="utf-8")):
+        path = f"tasks/{name}.json"
+        makers[path] = partial(cached, path, partial(lambda name: _dump(task_data(name)), name))
     memo = Memo()
     for row in rows:
         key = row["key"]
@@ -273,7 +277,7 @@ class Site:
     def _worker(self, text: str) -> bytes:
         """The service worker. It keeps the files of a visit, and those about other rules once they are opened."""
         first = {self.start, f"rules/{self.rows[0]['key']}.json"}
-        lazy = re.compile(r"rules/|parts/licenses/|licenses\.txt|sw\.js")
+        lazy = re.compile(r"rules/|tasks/|parts/licenses/|licenses\.txt|sw\.js")
         kept = [name for name in self.files if name in first or not lazy.match(name)]
         hashes = {name: hashlib.sha256(self.files[name]()).hexdigest()[:16] for name in kept}
         version = hashlib.sha256(_dump([text, hashes, code_version()])).hexdigest()[:16]
@@ -451,6 +455,7 @@ ABSENT = (
     "web/page",
     "web/parts",
     "web/made",
+    "web/playable.py",
     "web/site.py",
 )
 """Parts of powderdsl that `web/bridge.py` does not import: the command line, what requires torch, and the page itself."""

@@ -195,3 +195,15 @@ def test_a_universe_opens_by_its_seed(first: dict[str, Any]) -> None:
     assert (first["back"], "world of the link" in first["linked"]) == ("universe_7", True)
     assert "universe" in first["refused"]
     assert first["problems"] == []
+
+
+def test_tasks_are_played_and_replayed(folder: Path) -> None:
+    found = saw("tasks.mjs", folder)
+    assert "ice-bridge" in found["list"]
+    assert "24 of 24 actions left. A click acts on 4×4 cells; 3 steps follow." in found["begun"]
+    assert "random\t0.047\nnothing\t0\n" in found["begun"]
+    assert (found["you"], found["hash"]) == ("0.013", "#task=ice-bridge&world=0&actions=490449040014")
+    assert (found["reloaded"], found["replayed"]) == (True, True)
+    assert found["said"] == "These were 3 actions of a link: they returned 0.013."
+    assert "0 of 24 actions left. Not done." in found["over"]
+    assert (found["ended"], found["problems"]) == (None, [])

@@ -62,6 +62,7 @@ const saveAll = async (shared) => download(new Blob([await toBytes(shared)]), "w
 
 /** Opens what a link holds. */
 export async function openLink(fragment) {
+  if (fragment.startsWith("#task=")) return (await import("./tasks.js")).openTask(fragment, app.isBack && !app.linkOpened);
   const universe = /^#universe=0*(\d{1,10})$/.exec(fragment);
   if (universe) return openRules(`universe_${universe[1]}`, { run: !isStill() });
   const shared = await fromFragment(fragment);
@@ -204,6 +205,6 @@ addEventListener("drop", (event) => {
   openAll([...(event.dataTransfer?.files ?? [])]).catch(failed);
 });
 addEventListener("hashchange", () => history.state?.work || openLink(location.hash).catch(failed));
-(app.isBack ? Promise.resolve() : openLink(location.hash))
+(app.isBack && !location.hash.startsWith("#task=") ? Promise.resolve() : openLink(location.hash))
   .catch(failed)
   .finally(() => (app.linkOpened = true));

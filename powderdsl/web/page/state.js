@@ -34,6 +34,7 @@ export const app = {
   /** Whether rules run that the page has compiled, not the site's own. */ compiled: false,
   /** The files that were opened, for the editor, which comes later; null for those of the site. */ opened: null,
   /** Whether the next engine takes over the values of parameters. */ keepParameters: false,
+  /** What clicks on the world do while a task is played. @type {{act: Function, mark: Function} | null} */ play: null,
   frames: 0,
   /** Earlier moments of this world, from which its steps can be repeated; none from before an edit. */
   /** @type {import("./engine.js").Snapshot[]} */ checkpoints: [],

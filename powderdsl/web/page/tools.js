@@ -59,6 +59,7 @@ function setChosenField() {
 app.surface = new Surface($("canvas"), {
   start(cell, { erases = false, picks = false }) {
     if (picks) return choose(app.engine.byId.get(app.engine.ids()[cell[0] * app.engine.columns + cell[1]]));
+    if (app.play) return app.play.act(cell);
     if (app.tool === "look") return app.explain ? app.explain(cell) : say("The compiler is still loading.");
     remember();
     app.painted = true;
@@ -83,12 +84,14 @@ app.surface = new Surface($("canvas"), {
   leave: () => [leaveCell(), outline(null)],
 });
 
-function outline(cell) {
+/** Outlines what a tool at a cell would change; nothing for null. */
+export function outline(cell) {
   const { width, height } = $("overlay");
   const context = $("overlay").getContext("2d");
   context.clearRect(0, 0, width, height);
-  if (!cell) return;
   const scale = width / app.engine.columns;
+  if (app.play) return app.play.mark(context, scale, cell);
+  if (!cell) return;
   const plain = ["fill", "look"].includes(app.tool);
   const across = plain ? 1 : app.brush.size;
   const low = -Math.floor((across - 1) / 2);

@@ -1,0 +1,58 @@
+"""Returns that the playground shows beside one's own: `python docs/task_scores.py` writes `web/page/scores.json`.
+
+Of each task that can be played there, in each of its worlds: what its expert (if there is one), random actions and doing
+nothing return. Random is a mean over PLAYS episodes.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+from powderdsl.tasks.episodes import Episodes, TaskProgram, compile_task
+from powderdsl.tasks.players import ExpertPlayer
+from powderdsl.web.playable import WORLDS, playable
+from powderdsl.web.site import PAGE
+
+PLAYS = 16
+
+Player = Callable[[Episodes], Tensor | None]
+
+
+def returns(program: TaskProgram, worlds: Tensor, player: Player) -> Tensor:
+    """The return of a player in each of some worlds, float64 [n]."""
+    episodes = program.start(worlds)
+    total = torch.zeros(len(worlds), dtype=torch.float64)
+    going = torch.ones(len(worlds), dtype=torch.bool)
+    while bool(going.any()):
+        episodes, reward, _, over = program.act(episodes, player(episodes))
+        total += torch.where(going, reward.double(), 0.0)
+        going &= ~over
+    return total
+
+
+def scores(name: str) -> dict[str, list[float]]:
+    """The returns of a task in its worlds, by player."""
+    program = compile_task(name)
+    worlds = torch.arange(WORLDS)
+    draws = torch.Generator().manual_seed(0)
+    nvec = torch.tensor(program.action_nvec)
+
+    def chance(episodes: Episodes) -> Tensor:
+        return (torch.rand(len(episodes), 5, generator=draws) * nvec).long()
+
+    expert = {"expert": returns(program, worlds, ExpertPlayer(program))} if program.task.expert else {}
+    played = {
+        **expert,
+        "random": returns(program, worlds.repeat(PLAYS), chance).view(PLAYS, -1).mean(0),
+        "nothing": returns(program, worlds, lambda _: None),
+    }
+    return {player: [round(value, 5) for value in found.tolist()] for player, found in played.items()}
+
+
+if __name__ == "__main__":
+    lines = [f"{json.dumps(name)}: {json.dumps(scores(name))}" for name in playable()]
+    (PAGE / "scores.json").write_text("{\n" + ",\n".join(lines) + "\n}\n", encoding="utf-8")
