@@ -8,15 +8,15 @@ import { launch } from "./browser.mjs";
 const [address, folder] = process.argv.slice(2);
 const AXE = readFileSync(fileURLToPath(import.meta.resolve("axe-core/axe.min.js")), "utf8");
 const SIZES = [[1440, 900], [768, 1024], [390, 844], [360, 640], [844, 390]];
-const PANELS = ["rules-panel", "parameters", "checks", "gallery"];
+const PANELS = ["rules-panel", "parameters", "checks", "gallery", "tasks"];
 const browser = await launch();
 const seen = { violations: [], small: {}, wide: [], reach: {} };
 const problems = [];
 
-async function open(options, path = "play.html") {
+async function open({ tour = false, ...options }, path = "play.html") {
   const context = await browser.newContext({ bypassCSP: true, ...options });
   const page = await context.newPage();
-  await page.addInitScript(() => localStorage.setItem("toured", "yes"));
+  if (!tour) await page.addInitScript(() => localStorage.setItem("toured", "yes"));
   page.on("pageerror", (error) => problems.push(String(error)));
   await page.goto(address + path);
   if (path.startsWith("play")) await page.waitForFunction(() => globalThis.powderdsl?.linkOpened && powderdsl.firstPicture, null, { timeout: 60_000 });
@@ -24,20 +24,21 @@ async function open(options, path = "play.html") {
 }
 
 /** What axe finds, with the place where it was found. */
-async function check(page, where) {
+async function check(page, where, part = "html") {
   await page.evaluate(AXE);
-  const found = await page.evaluate(async () => (await axe.run(document, { resultTypes: ["violations"] })).violations);
+  const found = await page.evaluate(async (one) => (await axe.run(one, { resultTypes: ["violations"] })).violations, part);
   for (const { id, nodes } of found) seen.violations.push(`${where}: ${id}: ${nodes.slice(0, 3).map((one) => one.target.join(" ")).join(", ")}`);
 }
 
 /** Buttons and fields that are smaller than a finger; the words of a checkbox count. */
-const small = (page) =>
-  page.evaluate(() =>
-    [...document.querySelectorAll("button, select, summary, input, a[href]")]
+const small = (page, inside = "") =>
+  page.evaluate((within) =>
+    [...document.querySelectorAll(`${within}:is(button, select, summary, input, a[href])`)]
       .filter((one) => one.checkVisibility({ visibilityProperty: true }) && one.id !== "file")
       .map((one) => [one, (one.type === "checkbox" ? one.closest("label") : one).getBoundingClientRect()])
       .filter(([, { width, height }]) => width < 40 || height < 40)
       .map(([one, { width, height }]) => `${one.id || one.textContent || one.ariaLabel} ${Math.round(width)}×${Math.round(height)}`),
+    inside,
   );
 
 for (const colorScheme of ["light", "dark"])
@@ -48,6 +49,8 @@ for (const colorScheme of ["light", "dark"])
     for (const panel of PANELS) {
       if (panel !== "rules-panel" || phone) await page.locator(`[data-panel=${panel}]`).click();
       if (panel === "gallery") await page.locator(".card").first().waitFor();
+      if (panel === "tasks") await page.locator("#tasks .wide").last().click();
+      if (panel === "tasks") await page.locator("#tasks table").waitFor();
       await check(page, `${where} ${panel}`);
       if (phone && colorScheme === "light") seen.small[`${where} ${panel}`] = await small(page);
     }
@@ -63,12 +66,33 @@ for (const colorScheme of ["light", "dark"])
       await check(page, `${where} keys`);
       await page.keyboard.press("Escape");
     }
+    await page.locator("#rules-of").click();
+    await check(page, `${where} mentions`, "#mentions");
+    await page.locator("#mentions button", { hasText: "Close" }).click();
+    if (phone) await page.locator("[data-panel=rules-panel]").click();
+    const dialogs = [["new", () => page.locator("#new-element").click()], ["universe", () => page.locator("#rules").selectOption("universe…")]];
+    for (const [name, show] of dialogs) {
+      await show();
+      await page.locator(`#${name}`).waitFor();
+      await check(page, `${where} ${name}`, `#${name}`);
+      if (phone && colorScheme === "light") seen.small[`${where} ${name}`] = await small(page, `#${name} `);
+      await page.screenshot({ path: join(folder, `${width}-${colorScheme}-${name}.png`) });
+      await page.keyboard.press("Escape");
+    }
     await page.locator("#save summary").click();
     await check(page, `${where} menu`);
     await page.keyboard.press("Escape");
     if (await page.evaluate(() => document.documentElement.scrollWidth > innerWidth)) seen.wide.push(where);
     await page.screenshot({ path: join(folder, `${width}-${colorScheme}.png`) });
     await page.context().close();
+    const first = await open({ viewport: { width, height }, colorScheme, tour: true, hasTouch: phone, isMobile: phone });
+    await first.locator("#tour").waitFor();
+    for (const step of [1, 2, 3]) {
+      await check(first, `${where} tour ${step}`, "#tour");
+      await first.screenshot({ path: join(folder, `${width}-${colorScheme}-tour-${step}.png`) });
+      await first.locator("#tour button").first().click();
+    }
+    await first.context().close();
   }
 for (const colorScheme of ["light", "dark"]) {
   const landing = await open({ viewport: { width: 390, height: 844 }, colorScheme }, "");

@@ -140,7 +140,7 @@ def test_axe_finds_nothing(felt: dict[str, Any]) -> None:
 
 def test_phones_have_the_world_the_palette_and_large_buttons(felt: dict[str, Any]) -> None:
     assert {where: names for where, names in felt["small"].items() if names} == {}
-    assert len(felt["small"]) == 12
+    assert len(felt["small"]) == 21
     assert {where: names for where, names in felt["reach"].items() if names} == {}
     assert felt["wide"] == []
 

@@ -65,6 +65,14 @@ def test_rules_that_were_chosen_last_run(seen: dict[str, Any]) -> None:
     assert seen["edited"][1]
 
 
+def test_packs_that_are_off_and_parameters_can_be_undone(seen: dict[str, Any]) -> None:
+    on, off = [[], True], [["wind"], False]
+    assert seen["off"] == [off, on, off, on]
+    first, changed, *rest = seen["parameter"]
+    assert changed == pytest.approx([0.25, 0.25])
+    assert rest == [first, changed]
+
+
 def test_seeds_are_those_of_the_command_line(seen: dict[str, Any]) -> None:
     most = str(2**63 - 1)
     accepted = ["99999999999", most, most, most, "1000"]

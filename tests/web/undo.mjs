@@ -103,6 +103,29 @@ seen.raced = [raced.menus[0], raced.key, raced.pack, Object.keys(await page.eval
 await page.locator("#undo").click();
 await settled();
 seen.edited = [await text("rules"), await page.evaluate(() => powderdsl.edits.files["sand.yaml"].includes("density: 3"))];
+
+// A pack that is switched off comes back, with the fields of its rules; so does the value of a parameter.
+const packs = () => page.evaluate(() => [[...powderdsl.edits.off], powderdsl.engine.fields.some((one) => one.name === "velocity")]);
+await page.locator("#packs .pack", { hasText: "wind" }).locator("input").uncheck();
+await applied();
+seen.off = [await packs()];
+for (const way of ["undo", "redo", "undo"]) {
+  await page.locator(`#${way}`).click();
+  await settled();
+  await applied();
+  seen.off.push(await packs());
+}
+await page.locator("#tab-parameters").click();
+const slider = page.locator("#parameters input").first();
+const value = async () => [await page.evaluate(() => powderdsl.engine.values[0]), Number(await slider.inputValue())];
+seen.parameter = [await value()];
+await slider.fill("0.25");
+seen.parameter.push(await value());
+for (const way of ["undo", "redo"]) {
+  await page.locator(`#${way}`).click();
+  await settled();
+  seen.parameter.push(await value());
+}
 seen.problems = problems;
 console.log(JSON.stringify(seen, null, 1));
 await browser.close();

@@ -1,15 +1,9 @@
 // The editor of rule files: CodeMirror with YAML, colors for the line language, completion and diagnostics.
 
-import { autocompletion, closeBrackets, completionKeymap } from "@codemirror/autocomplete";
-import { defaultKeymap, history, historyKeymap, indentWithTab } from "@codemirror/commands";
-import { yaml } from "@codemirror/lang-yaml";
-import { HighlightStyle, bracketMatching, indentOnInput, syntaxHighlighting } from "@codemirror/language";
-import { lintGutter, setDiagnostics } from "@codemirror/lint";
-import { highlightSelectionMatches, searchKeymap } from "@codemirror/search";
-import { EditorState, StateEffect } from "@codemirror/state";
-import { Decoration, EditorView, MatchDecorator, ViewPlugin, drawSelection, hoverTooltip, keymap, lineNumbers } from "@codemirror/view";
-import { highlightActiveLine, highlightActiveLineGutter } from "@codemirror/view";
-import { tags } from "@lezer/highlight";
+import { autocompletion, closeBrackets, completionKeymap, defaultKeymap, history, historyKeymap, indentWithTab, yaml,
+  HighlightStyle, bracketMatching, indentOnInput, syntaxHighlighting, lintGutter, setDiagnostics,
+  highlightSelectionMatches, searchKeymap, EditorState, StateEffect, Decoration, EditorView, MatchDecorator,
+  ViewPlugin, drawSelection, hoverTooltip, keymap, lineNumbers, highlightActiveLine, highlightActiveLineGutter, tags } from "./parts/editor.js";
 import { compiler } from "./compiler.js";
 import { make } from "./dom.js";
 

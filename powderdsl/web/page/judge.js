@@ -7,23 +7,11 @@ const AIMS = 9; // directions of blowing: row by row, from up left to down right
 const CODE = "0123456789abcdefghijklmnopqrstuvwxyz";
 
 const OPS = {
-  add: (a, b) => a + b,
-  sub: (a, b) => a - b,
-  mul: (a, b) => a * b,
-  div: (a, b) => (b ? a / b : 0),
-  quotient: (a, b) => (b ? Math.floor(a / b) : 0),
-  mod: (a, b) => (b ? a - b * Math.floor(a / b) : 0),
-  neg: (a) => -a,
-  abs: Math.abs,
-  min: Math.min,
-  max: Math.max,
-  lt: (a, b) => Number(a < b),
-  le: (a, b) => Number(a <= b),
-  eq: (a, b) => Number(a === b),
-  and: (a, b) => a * b,
-  or: Math.max,
-  not: (a) => 1 - a,
-  choose: (condition, yes, no) => (condition ? yes : no),
+  add: (a, b) => a + b, sub: (a, b) => a - b, mul: (a, b) => a * b, div: (a, b) => (b ? a / b : 0), neg: (a) => -a,
+  quotient: (a, b) => (b ? Math.floor(a / b) : 0), mod: (a, b) => (b ? a - b * Math.floor(a / b) : 0),
+  abs: Math.abs, min: Math.min, max: Math.max, choose: (condition, yes, no) => (condition ? yes : no),
+  lt: (a, b) => Number(a < b), le: (a, b) => Number(a <= b), eq: (a, b) => Number(a === b),
+  and: (a, b) => a * b, or: Math.max, not: (a) => 1 - a,
 };
 
 /** The value of an expression of a goal. */

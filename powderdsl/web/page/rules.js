@@ -211,6 +211,7 @@ function exchange(texts, like = rules.moment()) {
 }
 
 function toggle(pack) {
+  remember([]);
   if (!rules.off.delete(pack)) rules.off.add(pack);
   edited();
   showTabs();

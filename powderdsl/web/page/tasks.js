@@ -143,10 +143,8 @@ function showTask() {
 
 async function shareResult() {
   history.replaceState(history.state, "", address());
-  await navigator.clipboard.writeText(location.href).then(
-    () => say("The link is copied: it replays your actions."),
-    () => say("The address bar holds the link: it replays your actions."),
-  );
+  const copied = await navigator.clipboard.writeText(location.href).then(() => true, () => false);
+  say(`${copied ? "The link is copied" : "The address bar holds the link"}: it replays your actions.`);
 }
 
 /** Opens the task of a link, and replays the actions in it. */
