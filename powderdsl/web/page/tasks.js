@@ -19,6 +19,7 @@ const [scores, listed] = await Promise.all([json("scores.json"), json("tasks.jso
 const frame = () => new Promise((resolve) => requestAnimationFrame(resolve));
 
 function showList() {
+  if (judge && location.hash.startsWith("#task=")) history.replaceState(history.state, "", location.pathname + location.search);
   [judge, app.play] = [null, null];
   outline(null);
   const rows = Object.entries(listed).flatMap(([key, worlds]) => (listedRules(key) ? worlds : [])).map(({ name, about }) => [name.replace(/^task /, ""), about]);
@@ -32,6 +33,7 @@ function showList() {
 /** Begins a task. @param {boolean} keeps  whether the world on the page stays as it is */
 async function play(name, number, keeps = false) {
   const task = await json(`tasks/${name}.json`);
+  if (keeps && app.rules.key !== task.rules) return; // other rules were opened since
   const { rows, columns } = task.starts[number].world;
   if (app.rules.key !== task.rules) await openRules(task.rules, { run: false });
   setRunning(false);
@@ -156,12 +158,13 @@ export async function openTask(fragment, keeps = false) {
   if (!(number in scores[name].nothing)) throw new Error(`The task ${name} has the worlds 0 to ${count - 1} here.`);
   await play(name, number, keeps);
   const mine = judge;
-  for (const one of read(asked.get("actions") ?? "", judge.task)) {
+  for (const one of mine ? read(asked.get("actions") ?? "", mine.task) : []) {
     if (mine !== judge) return;
     if (keeps && !judge.over) [...judge.act(one)];
     else await act(one);
   }
-  if (mine === judge) showTask();
+  if (!mine || mine !== judge) return;
+  showTask();
   if (judge.actions.length) say(`These were ${judge.actions.length} actions of a link: they returned ${rounded(judge.total)}.`);
 }
 
