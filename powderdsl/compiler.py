@@ -56,14 +56,20 @@ def shipped_rules() -> list[str]:
 @cache
 def shipped_words() -> dict[str, str]:
     """The words that the shipped packs define, each with its pack."""
+    packs: dict[str, str] = {}
+    for source in _shipped_sources():
+        for word in _words_in(source):
+            packs.setdefault(word, Path(source.name).stem)
+    return packs
+
+
+@lru_cache(maxsize=128)
+def _words_in(source: Source) -> tuple[str, ...]:
+    """The words that a file defines."""
     from powderdsl.model.composition.names import words_of_tree
     from powderdsl.syntax.yaml_tree import parse_yaml
 
-    packs: dict[str, str] = {}
-    for source in _shipped_sources():
-        for word in words_of_tree(parse_yaml(source, Reporter())):
-            packs.setdefault(word, Path(source.name).stem)
-    return packs
+    return tuple(words_of_tree(parse_yaml(source, Reporter())))
 
 
 @cache
@@ -171,10 +177,8 @@ def _report_more(
 ) -> None:
     """Report further mistakes in files, except those that may follow from the mistakes reported so far."""
     from powderdsl.model.check import check
-    from powderdsl.model.composition.names import words_of_tree
-    from powderdsl.syntax.yaml_tree import parse_yaml
 
-    lost = {word for source in reader.sources for word in words_of_tree(parse_yaml(source, Reporter()))}
+    lost = {word for source in reader.sources for word in _words_in(source)}
     for pack in packs:
         lost -= {decl.name.text for section in (*SHARED, "passes") for decl in getattr(pack, section)}
     later = Reporter()

@@ -123,6 +123,7 @@ def check(
     stored = overridden_ids(passes, sorted(elaborated.overridden), facts)
     for name, ids in stored.items():
         properties[name] = replace(properties[name], stored=ids)
+    facts = replace(facts)  # of other properties
     check_assigned(examples, composition, reporter)
     added = None if alone else AddedPacks(composition, check_alone)
     passes, undecided = check_logic(passes, facts, elaborated, reporter, added)

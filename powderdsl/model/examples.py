@@ -114,19 +114,33 @@ ANYTHING = "?"
 def check_examples(typer: Typer) -> tuple[Example, ...]:
     """The tests of all packs, checked: characters known, rows equally long."""
     examples = []
-    for name, pack in typer.symbols.packs.items():
+    composition = typer.symbols
+    for name, pack in composition.packs.items():
+        if not pack.tests:
+            continue
+        ids = {}
+        for known, element in composition.elements.items():
+            for word in (known, element.qualified, element.word or known):
+                ids[word] = composition.elements[composition.element(word, name) or known].id
+        # Glyphs mean what they mean without packs that the author of the test does not know.
+        alone = composition.glyphs_alone(composition.scope(name))
         for decl in pack.tests:
             with suppress(Poisoned, Unresolved):
-                examples.append(_ExampleReader(typer, name, decl).example())
+                examples.append(_ExampleReader(typer, name, decl, ids, alone).example())
     return tuple(examples)
 
 
 class _ExampleReader:
-    """Reads one test. Its methods raise Poisoned after reporting, Unresolved for a test that waits for a pack."""
+    """Reads one test. Its methods raise Poisoned after reporting, Unresolved for a test that waits for a pack.
 
-    def __init__(self, typer: Typer, pack: str, decl: TestDecl):
+    `ids` are by the words of elements that the pack uses, and `glyphs` are theirs in its scope.
+    """
+
+    def __init__(
+        self, typer: Typer, pack: str, decl: TestDecl, ids: Mapping[str, int], glyphs: Mapping[str, str]
+    ):
         self.typer, self.pack, self.decl = typer, pack, decl
-        self.composition = typer.symbols
+        self.composition, self.ids, self.glyphs = typer.symbols, ids, glyphs
         self.legend = self._legend()
         self.given: tuple[str, ...] = ()
         """The rows of the first world, once they are read."""
@@ -141,11 +155,8 @@ class _ExampleReader:
         size = f"`given` has {len(given)} row{'s' * (len(given) != 1)} of {len(given[0])}"
         if expect and decl.expect and (len(expect), len(expect[0])) != (len(given), len(given[0])):
             raise typer.fail("PD110", "`expect` has another size than `given`", decl.expect.span, size)
-        elements, ids = self.composition.elements, {}
-        for known, element in elements.items():
-            for word in (known, element.qualified, element.word or known):
-                ids[word] = elements[self.composition.element(word, self.pack) or known].id
-        ids |= {character: elements[meaning].id for character, meaning in self.legend.items()}
+        elements = self.composition.elements
+        ids = {**self.ids, **{character: elements[meaning].id for character, meaning in self.legend.items()}}
         fields = self._grids(decl.fields, ids, size, expected=False)
         expect_fields = self._grids(decl.expect_fields, ids, size, expected=True)
         params = self._params()
@@ -206,9 +217,7 @@ class _ExampleReader:
         """The elements, by global name, that the characters of a test stand for."""
         composition = self.composition
         legend = {element.glyph: name for name, element in composition.elements.items()}
-        # Glyphs mean what they mean without packs that the author of the test does not know.
-        alone = composition.glyphs_alone(composition.scope(self.pack))
-        legend |= {glyph: name for name, glyph in alone.items()}
+        legend |= {glyph: name for name, glyph in self.glyphs.items()}
         # What the pack's own file says comes first, whatever other packs took before.
         for name, decl in composition.names.declared(ElementDecl).items():
             if decl.pack == self.pack and decl.glyph:

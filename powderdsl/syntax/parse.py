@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from functools import cache
+from functools import cache, lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from powderdsl.diagnostics import Reporter, Source, Span
+from powderdsl.diagnostics import Reporter, Span
 from powderdsl.diagnostics.printable import shown_character
 from powderdsl.syntax.hints import CUT, character_help, expected_words, token_help, was_cut
 from powderdsl.syntax.yaml_tree import Node, Scalar
@@ -117,7 +117,6 @@ def parse_scalar(scalar: Scalar, start: str, reporter: Reporter) -> Syntax | Non
 def parse_text(line: Span, start: str, reporter: Reporter, usage: Sequence[str] = ()) -> Syntax | None:
     """Parse a line from a start symbol. Reports at most one syntax error, whose help is `usage` if given."""
     from lark.exceptions import UnexpectedInput
-    from lark.utils import TextSlice
 
     language = LANGUAGES[start]
     length, first = line.end - line.start, Span(line.source, line.start, line.start + 1)
@@ -127,7 +126,7 @@ def parse_text(line: Span, start: str, reporter: Reporter, usage: Sequence[str] 
         reporter.error(language.size, message, first, label, helps=helps)
         return None
     try:
-        tree = parser(language).parse(TextSlice(line.source.text, line.start, line.end), start=start)
+        tree = _tree(line.text, start)
     except UnexpectedInput as error:
         _report_syntax_error(error, line, language, reporter, usage)
         return None
@@ -136,7 +135,13 @@ def parse_text(line: Span, start: str, reporter: Reporter, usage: Sequence[str] 
         notes = ["a long chain of `and`, `or` or `+` nests as well"]
         reporter.error(language.size, message, first, notes=notes, helps=helps)
         return None
-    return _to_syntax(tree, line.source, Span(line.source, line.start, max(line.end, line.start + 1)))
+    return _to_syntax(tree, line, Span(line.source, line.start, max(line.end, line.start + 1)))
+
+
+@lru_cache(maxsize=1024)
+def _tree(text: str, start: str) -> Tree:
+    """The parsed line; editors ask for the same lines after each key. Raises UnexpectedInput."""
+    return parser(LANGUAGES[start]).parse(text, start=start)
 
 
 def depth(tree: Tree) -> int:
@@ -148,14 +153,15 @@ def depth(tree: Tree) -> int:
     return count
 
 
-def _to_syntax(tree: Tree | Token, source: Source, fallback: Span) -> Syntax:
+def _to_syntax(tree: Tree | Token, line: Span, fallback: Span) -> Syntax:
+    source, first = line.source, line.start
     if isinstance(tree, str):  # a token
-        start = tree.start_pos if tree.start_pos is not None else fallback.start
-        stop = tree.end_pos if tree.end_pos is not None else fallback.end
+        start = first + tree.start_pos if tree.start_pos is not None else fallback.start
+        stop = first + tree.end_pos if tree.end_pos is not None else fallback.end
         return Syntax("token", (), str(tree), Span(source, start, stop))
     meta = tree.meta
-    span = fallback if meta.empty else Span(source, meta.start_pos, meta.end_pos)
-    children = [_to_syntax(child, source, span) for child in tree.children]
+    span = fallback if meta.empty else Span(source, first + meta.start_pos, first + meta.end_pos)
+    children = [_to_syntax(child, line, span) for child in tree.children]
     text = " ".join(child.text for child in children if child.kind == "token")
     nodes = tuple(child for child in children if child.kind != "token")
     return Syntax(str(tree.data), nodes, text, span)
@@ -168,7 +174,8 @@ def _report_syntax_error(
 
     source, text = line.source, line.source.text
     if isinstance(error, UnexpectedCharacters):
-        start: int = error.pos_in_stream  # type: ignore[assignment]  # declared as None, set by this subclass
+        at: int = error.pos_in_stream  # type: ignore[assignment]  # declared as None, set by this subclass
+        start = line.start + at
         message = f"unexpected character {shown_character(text[start])}"
         fix = character_help(text, start, line.start)
         span, label = Span(source, start, start + 1), f"not part of a {language.noun}"
@@ -177,7 +184,8 @@ def _report_syntax_error(
     assert isinstance(error, UnexpectedToken)
     token = error.token
     at_end = token.type == "$END"
-    place = len(text[: line.end].rstrip()) if at_end or token.start_pos is None else token.start_pos
+    is_lost = at_end or token.start_pos is None
+    place = len(text[: line.end].rstrip()) if is_lost else line.start + token.start_pos
     start = min(max(place, line.start), max(len(text) - 1, 0))
     stop = start + (1 if at_end else len(token))
     accepted = set(error.accepts or error.expected or ())

@@ -11,6 +11,7 @@ import math
 from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from fractions import Fraction
+from functools import cached_property, lru_cache
 from typing import Any, NamedTuple, TypeVar
 
 from powderdsl.model.operations import OPERATIONS, Bounds
@@ -70,6 +71,13 @@ class Facts:
     """Names of the elements by id, for examples in messages."""
     budget: Budget = field(default_factory=Budget, compare=False, repr=False)
 
+    @cached_property
+    def known(self) -> _Known:
+        """What equal facts share."""
+        return _known(
+            self.ids, tuple(self.properties.items()), tuple(self.fields.items()), self.side_multiple
+        )
+
     def relaxed(self) -> Facts:
         """The facts with unknown properties, as elements of other packs may have."""
         free = dict(self.properties)
@@ -81,9 +89,9 @@ class Facts:
 
 def decide(facts: Facts, conditions: Conditions, lets: Lets | None = None) -> bool | None:
     """True if the conditions may hold together; None if deciding takes too much work. False is a proof."""
-    if lets and _ask(facts, conditions, None, _Search.possible) is False:
+    if lets and _decide(facts, conditions, {}) is False:
         return False  # whatever the values of lets are
-    return _ask(facts, conditions, lets, _Search.possible)
+    return _decide(facts, conditions, lets or {})
 
 
 def satisfiable(facts: Facts, conditions: Conditions, lets: Lets | None = None) -> bool:
@@ -143,6 +151,39 @@ def _ask(
     finally:
         if reserve:
             budget.left = max(budget.left, 0) + reserve
+
+
+class _Known:
+    """Facts to which answers are kept; a key by identity."""
+
+    def __init__(self, facts: Facts):
+        self.facts = facts
+
+
+@lru_cache(maxsize=64)
+def _known(
+    ids: tuple[int, ...], properties: tuple[tuple[str, Property], ...], fields: tuple[tuple[str, Field], ...], side: int
+) -> _Known:  # fmt: skip
+    return _Known(Facts(ids, dict(properties), dict(fields), side))
+
+
+@lru_cache(maxsize=2048)
+def _answered(
+    known: _Known, conditions: tuple[tuple[Expr, Offset], ...], lets: tuple[tuple[str, Expr], ...], most: int
+) -> tuple[bool | None, int]:
+    """The answer to a question, and its work: editors ask the same after each key."""
+    budget = Budget(most, most)
+    answer = _ask(replace(known.facts, budget=budget), conditions, dict(lets), _Search.possible)
+    return answer, most - max(budget.left, 0)
+
+
+def _decide(facts: Facts, conditions: Conditions, lets: Lets) -> bool | None:
+    budget = facts.budget
+    if budget.left < budget.most:
+        return _ask(facts, conditions, lets, _Search.possible)
+    answer, work = _answered(facts.known, tuple(conditions), tuple(lets.items()), budget.most)
+    budget.left -= work
+    return answer
 
 
 class _Term(NamedTuple):
