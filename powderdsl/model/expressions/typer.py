@@ -391,9 +391,11 @@ class Typer:
                 return Expr(op, table[name].kind, value=name, span=span)
         if name in symbols.streams:
             return Expr("draw", DRAW, value=name, span=span)
+        if scope.pack:
+            return None
         # What belongs to no pack, such as a task, may leave out the pack of a parameter that only one has.
         ends = [qualified for qualified in symbols.params if qualified.endswith(f".{name}")]
-        if scope.pack or len(ends) != 1:
+        if len(ends) != 1:
             return None
         return Expr("param", symbols.params[ends[0]].kind, value=ends[0], span=span)
 

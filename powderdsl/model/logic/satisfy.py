@@ -89,9 +89,9 @@ class Facts:
 
 def decide(facts: Facts, conditions: Conditions, lets: Lets | None = None) -> bool | None:
     """True if the conditions may hold together; None if deciding takes too much work. False is a proof."""
-    if lets and _decide(facts, conditions, {}) is False:
+    if lets and _answer(facts, conditions, None, _Search.possible) is False:
         return False  # whatever the values of lets are
-    return _decide(facts, conditions, lets or {})
+    return _answer(facts, conditions, lets, _Search.possible)
 
 
 def satisfiable(facts: Facts, conditions: Conditions, lets: Lets | None = None) -> bool:
@@ -124,7 +124,7 @@ class Answers(dict[Key, bool | None]):
 
 def single_domains(facts: Facts, condition: Expr, lets: Lets) -> dict[Variable, frozenset[object]]:
     """The values of single variables that a condition allows: an element, a field or a count at a place."""
-    return _ask(facts, [(condition, HERE)], lets, _Search.single_domains) or {}
+    return _answer(facts, [(condition, HERE)], lets, _Search.single_domains) or {}
 
 
 def example(facts: Facts, conditions: Conditions, lets: Lets) -> dict[Offset, int]:
@@ -169,21 +169,29 @@ def _known(
 
 @lru_cache(maxsize=2048)
 def _answered(
-    known: _Known, conditions: tuple[tuple[Expr, Offset], ...], lets: tuple[tuple[str, Expr], ...], most: int
-) -> tuple[bool | None, int]:
+    known: _Known,
+    conditions: tuple[tuple[Expr, Offset], ...],
+    lets: tuple[tuple[str, Expr], ...],
+    most: int,
+    answer: Callable[[_Search], Any],
+) -> tuple[Any, int]:
     """The answer to a question, and its work: editors ask the same after each key."""
     budget = Budget(most, most)
-    answer = _ask(replace(known.facts, budget=budget), conditions, dict(lets), _Search.possible)
-    return answer, most - max(budget.left, 0)
+    found = _ask(replace(known.facts, budget=budget), conditions, dict(lets), answer)
+    return found, most - max(budget.left, 0)
 
 
-def _decide(facts: Facts, conditions: Conditions, lets: Lets) -> bool | None:
+def _answer(
+    facts: Facts, conditions: Conditions, lets: Lets | None, answer: Callable[[_Search], Answer]
+) -> Answer | None:
+    """As `_ask`, for answers that name no places in files."""
     budget = facts.budget
     if budget.left < budget.most:
-        return _ask(facts, conditions, lets, _Search.possible)
-    answer, work = _answered(facts.known, tuple(conditions), tuple(lets.items()), budget.most)
+        return _ask(facts, conditions, lets, answer)
+    found, work = _answered(facts.known, tuple(conditions), tuple((lets or {}).items()), budget.most, answer)
     budget.left -= work
-    return answer
+    result: Answer | None = found
+    return result
 
 
 class _Term(NamedTuple):
