@@ -8,6 +8,9 @@ TORCH_FLAGS ?=
 ARGS ?=
 JOBS ?= auto
 
+# Whether `make site` draws elements and tasks.
+PICTURES ?= yes
+
 VENV := .venv
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check
@@ -19,7 +22,7 @@ test test-all golden: export OMP_NUM_THREADS ?= 1
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help setup demo test test-all check lint types format golden web vscode wheel clean distclean mutation fuzz
+.PHONY: help setup demo test test-all check lint types format golden web vscode wheel site release clean distclean mutation fuzz
 
 help:  ## list these targets
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/\1|\2/p' $(MAKEFILE_LIST) | while IFS='|' read -r name about; do printf '  make %-10s %s\n' "$$name" "$$about"; done
@@ -39,6 +42,10 @@ $(VENV)/.core: pyproject.toml constraints.txt
 $(VENV)/.ready: $(VENV)/.core
 	@echo "setting up $(VENV): tools for tests, checks, training, video and clusters"
 	@$(INSTALL) --no-build-isolation --editable '.[dev,lsp,minari,ray,rl,sb3-contrib,torchrl,video]'
+	@touch $@
+
+$(VENV)/.docs: $(VENV)/.ready
+	@$(INSTALL) --no-build-isolation --editable '.[docs]'
 	@touch $@
 
 tests/web/node_modules: tests/web/package-lock.json
@@ -93,8 +100,22 @@ wheel: $(VENV)/.ready  ## build dist/*.whl
 	@$(BIN)/python -m build --wheel --no-isolation
 	@ls -l dist/*.whl
 
+site: $(VENV)/.docs  ## build the documentation in site/, with the playground (PICTURES=no: without films, in a minute)
+	@NO_MKDOCS_2_WARNING=1 PICTURES=$(PICTURES) $(BIN)/mkdocs build --strict --quiet
+	@if test -d powderdsl/web/parts; then $(BIN)/powderdsl play --no-open --export site/play; \
+	else echo 'site/play/ is only a stub: `make web` fetches the playground' >&2; fi
+	@$(BIN)/python docs/check_site.py site
+
+release: $(VENV)/.ready web  ## build and check dist/*.tar.gz and dist/*.whl, for PyPI
+	@$(INSTALL) --no-build-isolation --editable '.[release]'
+	@rm -rf dist
+	@$(BIN)/python -c 'from powderdsl.web.site import write_made; write_made()'
+	@$(BIN)/python -m build --no-isolation
+	@$(BIN)/twine check --strict dist/*
+	@$(BIN)/python -m tests.release dist/*
+
 clean:  ## remove what the targets made, except .venv
-	@rm -rf build dist demo.gif .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	@rm -rf build dist site .site demo.gif .pytest_cache .mypy_cache .ruff_cache .hypothesis
 	@find powderdsl tests -name __pycache__ -type d -prune -exec rm -rf {} +
 
 distclean: clean  ## clean, and remove what `make setup` and `make web` installed
