@@ -154,13 +154,17 @@ def test_the_notebook_runs_from_top_to_bottom(torch: Any, capsys: pytest.Capture
     assert "error[PD301]: unknown name `watr`" in capsys.readouterr().out
 
 
-def test_the_notebook_is_stored_without_outputs() -> None:
+def test_the_notebook_is_stored_with_its_outputs() -> None:
+    """Readers on GitHub see the pictures and the returns without running it."""
     notebook = json.loads((EXAMPLES / "tour.ipynb").read_text(encoding="utf-8"))
     assert notebook["nbformat"] == 4
-    assert len({one["id"] for one in notebook["cells"]}) == len(notebook["cells"])
-    for cell in notebook["cells"]:
-        if cell["cell_type"] == "code":
-            assert (cell["outputs"], cell["execution_count"]) == ([], None)
+    assert len({cell["id"] for cell in notebook["cells"]}) == len(notebook["cells"])
+    cells = [cell for cell in notebook["cells"] if cell["cell_type"] == "code"]
+    assert [cell["execution_count"] for cell in cells] == list(range(1, len(cells) + 1))
+    outputs = [output for cell in cells for output in cell["outputs"]]
+    assert not [output for output in outputs if output["output_type"] == "error"]
+    assert sum("image/png" in output.get("data", {}) for output in outputs) == 3
+    assert any("expert:" in "".join(output.get("text", "")) for output in outputs)
 
 
 @pytest.mark.parametrize("name", SCRIPTS)
