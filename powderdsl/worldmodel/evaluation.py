@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from PIL import Image, ImageDraw, ImageFont
 
 from powderdsl.experiments.runs import differences, misfit
 from powderdsl.model.types import Ruleset
@@ -219,6 +220,8 @@ def unseen_data(
 
 RIGHT, WRONG = np.array([(235, 235, 235), (200, 30, 30)], np.uint8)
 """Colors of cells that were predicted correctly, and of others."""
+TITLE = 14
+"""Pixels of the line above a picture."""
 
 
 @dataclass(frozen=True)
@@ -262,13 +265,18 @@ def recorded_strips(predict: Network, recording: Recording, count: int = 8) -> l
 
 
 def sheet(strips: list[Strip], rules: Ruleset, *, factor: int = 2) -> NDArray[np.uint8]:
-    """Strips one below the other, uint8 [H', W', 3]: start, truth, prediction, error. A cell has `factor`² pixels.
+    """Strips one below the other, uint8 [H', W', 3]: start, truth, prediction, errors. A cell has `factor`² pixels.
 
-    Colors do not follow fields here: networks predict elements alone.
+    Each picture has a title. Colors do not follow fields here: networks predict elements alone.
     """
-    colors = palette(rules.elements)
+    colors, font = palette(rules.elements), ImageFont.load_default()
     pictures = []
     for strip in strips:
-        pictures += [rgb(ids, colors) for ids in (strip.start, strip.truth, strip.predicted)]
-        pictures.append(np.where(strip.wrong[..., None], WRONG, RIGHT))
-    return contact_sheet([scale(picture, factor) for picture in pictures], columns=4, gap=4)
+        errors = np.where(strip.wrong[..., None], WRONG, RIGHT)
+        worlds = [rgb(ids, colors) for ids in (strip.start, strip.truth, strip.predicted)]
+        titles = (strip.name, "truth", "prediction", f"{strip.wrong.mean():.1%} wrong")
+        for title, picture in zip(titles, [*worlds, errors], strict=True):
+            image = Image.fromarray(np.pad(scale(picture, factor), ((TITLE, 0), (0, 0), (0, 0))))
+            ImageDraw.Draw(image).text((2, 0), title, fill="white", font=font)
+            pictures.append(np.asarray(image))
+    return contact_sheet(pictures, columns=4, gap=4)

@@ -56,8 +56,8 @@ def test_train_eval_finetune_and_show(dunes: str, tmp_path: Path) -> None:
         "wm", "show", tuned, "--split", "two", "--steps", 16, "--out", out, "--backend", "torch", exits=0
     )
     assert [line.split(":")[0] for line in shown.stdout.splitlines()] == ["1  falling", "2  lying"]
-    # Two strips of four pictures of 14×18 cells, two pixels a cell, four between and around.
-    assert np.asarray(Image.open(out)).shape == (2 * 32 + 4, 4 * 40 + 4, 3)
+    # Two strips of four pictures of 14×18 cells, four pixels a cell, below titles of 14; four between and around.
+    assert np.asarray(Image.open(out)).shape == (2 * (14 + 56 + 4) + 4, 4 * (72 + 4) + 4, 3)
 
 
 def test_preset_and_options_make_the_configuration(tmp_path: Path, dunes: str) -> None:

@@ -215,7 +215,7 @@ def _times(trained: Trained, steps: int | None) -> int:
 @opt.output("--out", "FILE", "The picture to write.", ".png", required=True)
 @opt.option("--steps", (1, 4096), "Steps to predict.  [default: as trained]")
 @opt.option("--after", (0, 10**6), "Steps that worlds run before the start.  [default: 0]")
-@opt.option("--scale", (1, 16), "Pixels per cell.", 2)
+@opt.option("--scale", (1, 16), "Pixels per cell.", 4)
 def show_command(run: str, out: Path, scale: int, **values: Any) -> None:
     """Draw each test as a strip: start, truth, prediction, mistakes.
 
