@@ -34,14 +34,14 @@ def runs(tmp_path: Path) -> list[RunFolder]:
 def test_runs_that_differ_in_their_seed_make_one_curve(runs: list[RunFolder]) -> None:
     first, second = curves_of(runs, "held_out/return")
     assert (first.label, first.places, first.samples) == (
-        "learning_rate 0.1",
+        "learning rate 0.1",
         [0, 10],
         [[1.0, 3.0], [2.0, 4.0]],
     )
-    assert (second.label, second.places, second.samples) == ("learning_rate 0.2", [0, 10], [[0.0], [1.0]])
+    assert (second.label, second.places, second.samples) == ("learning rate 0.2", [0, 10], [[0.0], [1.0]])
     assert curves_of(runs, "loss") == []
     row = as_table([first]).splitlines()[2].split(" | ")
-    assert row[:4] == ["| learning_rate 0.1", "2", "0", "2"]
+    assert row[:4] == ["| learning rate 0.1", "2", "0", "2"]
     # Student's t of two values: 12.706 standard errors, here of √2 / √2.
     assert math.isclose(float(row[4].strip(" |")), 12.706, rel_tol=0.03)
 

@@ -40,6 +40,7 @@ def command(runs: tuple[str, ...], metrics: tuple[str, ...], out: Path | None) -
         click.echo(as_table(curves), nl=False)
         return
     title = str(folders[0].config.get("task", ""))
-    baselines = baselines_of(folders) if metrics == ("held_out/return",) else {}
-    write_curves(out, curves, ", ".join(metrics), baselines, Path(title).stem)
+    of_agents = metrics == ("held_out/return",)
+    axis = "return in held-out worlds" if of_agents else ", ".join(metrics)
+    write_curves(out, curves, axis, baselines_of(folders) if of_agents else {}, Path(title).stem)
     click.echo(str(out))

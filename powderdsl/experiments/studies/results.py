@@ -299,7 +299,8 @@ def curves_of(runs: Sequence[RunFolder], metric: str) -> list[Line]:
         ]
         steps = sorted(set.intersection(*map(set, by_seed.values())))
         samples = [[by_step[step] for by_step in by_seed.values()] for step in steps]
-        curves.append(Line(", ".join(map(" ".join, differ)), steps, samples))
+        label = ", ".join(f"{name.replace('_', ' ')} {value}" for name, value in differ)
+        curves.append(Line(label, steps, samples))
     return curves
 
 
