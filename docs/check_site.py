@@ -30,7 +30,11 @@ class PageLinks(HTMLParser):
 def dead_links(site: Path) -> Iterator[str]:
     """Lines such as `a/index.html: b.html#c`, for each link that leads nowhere."""
     # The playground builds its page with JavaScript and has tests of its own; 404.html has absolute links only.
-    pages = [page for page in sorted(site.rglob("*.html")) if page.relative_to(site).parts[0] not in ("play", "404.html")]
+    pages = [
+        page
+        for page in sorted(site.rglob("*.html"))
+        if page.relative_to(site).parts[0] not in ("play", "404.html")
+    ]
     links = {page.resolve(): PageLinks(page) for page in pages}
     for page, its in links.items():
         for target in its.targets:

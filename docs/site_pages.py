@@ -16,6 +16,7 @@ import re
 import subprocess
 import sys
 from collections.abc import Iterator, Mapping, Sequence
+from functools import cache
 from hashlib import sha256
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -24,13 +25,13 @@ from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files
 from mkdocs.structure.pages import Page
 
-ROOT = Path(__file__).resolve().parents[1]
-sys.path.insert(0, str(ROOT))  # runs from a checkout that is not installed
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # runs from a checkout that is not installed
 
 from powderdsl.cli.dispatch import GROUPS
 from powderdsl.compiler import shipped_tests, shipped_variants
 from powderdsl.tasks.shipped import load_task, shipped_tasks
 
+ROOT = Path(__file__).resolve().parents[1]
 CACHE = ROOT / ".site"
 COPIED = {"index.md": "README.md", "changelog.md": "CHANGELOG.md", "contributing.md": "CONTRIBUTING.md"}
 LINK = re.compile(r"(\]\()([^)\s#:]+)(#[^)\s]*)?(\))")
@@ -38,7 +39,17 @@ FENCED = re.compile(r"^```.*?^```$", re.MULTILINE | re.DOTALL)
 COMMENT = re.compile(r"^<!--.*?-->\n?", re.MULTILINE | re.DOTALL)
 
 API = {
-    "Rules and worlds": ("load", "compile", "Simulator", "World", "load_world", "save", "gif", "ledger", "CompileError"),
+    "Rules and worlds": (
+        "load",
+        "compile",
+        "Simulator",
+        "World",
+        "load_world",
+        "save",
+        "gif",
+        "ledger",
+        "CompileError",
+    ),
     "Environments": (
         "envs.tensor_env.TensorEnv",
         "envs.gym.PowderEnv",
@@ -56,12 +67,15 @@ def command(*words: str, out: str = "") -> bytes:
     CACHE.mkdir(exist_ok=True)
     key = sha256("\0".join([state_of_rules(), *words, out]).encode()).hexdigest()[:24]
     stored = CACHE / f"{key}{out or '.txt'}"
-    if not stored.exists():
+    if not stored.exists() or words[-1] == "--help":
         written = CACHE / f"{key}.part{out}"
         options = ["--out", str(written)] if out else []
         environment = {**os.environ, "COLUMNS": "100", "OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT)}
         run = subprocess.run(
-            [sys.executable, "-m", "powderdsl", *words, *options], cwd=ROOT, env=environment, capture_output=True
+            [sys.executable, "-m", "powderdsl", *words, *options],
+            cwd=ROOT,
+            env=environment,
+            capture_output=True,
         )
         if run.returncode not in (0, 1):
             raise RuntimeError(f"powderdsl {' '.join(words)}: {run.stderr.decode()}")
@@ -71,15 +85,11 @@ def command(*words: str, out: str = "") -> bytes:
     return stored.read_bytes()
 
 
+@cache
 def state_of_rules() -> str:
-    """A hash of all rules, tasks and messages that come with powderdsl."""
-    if not _state:
-        files = [path for name in ("rules", "tasks", "powderdsl/cli") for path in sorted((ROOT / name).rglob("*.[yp]*"))]
-        _state.append(sha256(b"".join(path.read_bytes() for path in files if path.is_file())).hexdigest())
-    return _state[0]
-
-
-_state: list[str] = []
+    """A hash of all rules and tasks that come with powderdsl."""
+    files = [path for name in ("rules", "tasks") for path in sorted((ROOT / name).rglob("*.yaml"))]
+    return sha256(b"".join(path.read_bytes() for path in files)).hexdigest()
 
 
 def json_of(*words: str) -> Any:
@@ -120,7 +130,9 @@ def element_pages(pictures: bool) -> Iterator[tuple[str, str | bytes]]:
         rows = []
         for element in shown["elements"]:
             page = f"{ruleset}/{element['name']}.md"
-            rows.append([f"{swatch(element)}[{element['name']}]({page})", code(element["pack"]), element["about"]])
+            rows.append(
+                [f"{swatch(element)}[{element['name']}]({page})", code(element["pack"]), element["about"]]
+            )
             picture = f"{element['name']}.gif" if pictures else ""
             yield f"elements/{page}", element_page(element, shown, facts, picture)
             if pictures:
@@ -137,19 +149,34 @@ def element_page(element: Mapping[str, Any], shown: Any, facts: Any, picture: st
     """A page about one element of a ruleset. `shown` and `facts` are of `show` and of `check --ledger`."""
     name = element["name"]
     known = next(entry for entry in facts["elements"] if entry["name"] == name)
-    parts = [f"# {name}\n\n{swatch(element)}An element of `{shown['name']}`, from the pack `{element['pack']}`. {element['about']}"]
+    parts = [
+        f"# {name}\n\n{swatch(element)}An element of `{shown['name']}`, from the pack `{element['pack']}`. {element['about']}"
+    ]
     if picture:
         parts.append(f"![{name} in a small world]({picture})")
     properties = [[code(key), str(value)] for key, value in element["properties"].items()]
     tags = ", ".join(map(code, element["tags"])) or "none"
-    parts.append(f"## Properties\n\n{table(['property', 'value'], properties)}\nTags: {tags}. Defined in {source_link(element['where'])}.")
+    parts.append(
+        f"## Properties\n\n{table(['property', 'value'], properties)}\nTags: {tags}. Defined in {source_link(element['where'])}."
+    )
     for title, key in (("What becomes it", "made_from"), ("What it becomes", "becomes")):
         rows = [
-            [other_link(other), "<br>".join(f"{code(facts['rules'][i]['rule'])}, {source_link(facts['rules'][i]['where'])}" for i in lines)]
+            [
+                other_link(other),
+                "<br>".join(
+                    f"{code(facts['rules'][i]['rule'])}, {source_link(facts['rules'][i]['where'])}"
+                    for i in lines
+                ),
+            ]
             for other, lines in known[key].items()
         ]
         parts.append(f"## {title}\n\n" + (table(["element", "rule"], rows) if rows else "Nothing."))
-    rules = " ".join(facts["rules"][i]["rule"] for key in ("made_from", "becomes") for lines in known[key].values() for i in lines)
+    rules = " ".join(
+        facts["rules"][i]["rule"]
+        for key in ("made_from", "becomes")
+        for lines in known[key].values()
+        for i in lines
+    )
     chances = [
         [code(param["name"]), f"{param['value']:.4g}", param["about"]]
         for param in shown["params"]
@@ -157,9 +184,15 @@ def element_page(element: Mapping[str, Any], shown: Any, facts: Any, picture: st
     ]
     if chances:
         parts.append(f"Parameters of these rules:\n\n{table(['parameter', 'value', 'about'], chances)}")
-    moves = [f"- {code(facts['rules'][i]['rule'])}, {source_link(facts['rules'][i]['where'])}" for i in known["moved_by"]]
+    moves = [
+        f"- {code(facts['rules'][i]['rule'])}, {source_link(facts['rules'][i]['where'])}"
+        for i in known["moved_by"]
+    ]
     parts.append("## What moves it\n\n" + ("\n".join(moves) or "Nothing: it stays in place."))
-    parts.append(f"## Conservation\n\nIts number: {known['number']}.\n\n" + "\n".join(f"- {line}" for line in laws(name, facts)))
+    parts.append(
+        f"## Conservation\n\nIts number: {known['number']}.\n\n"
+        + "\n".join(f"- {line}" for line in laws(name, facts))
+    )
     return "\n\n".join(parts) + "\n"
 
 
@@ -169,10 +202,18 @@ def other_link(name: str) -> str:
 
 def laws(name: str, facts: Any) -> Iterator[str]:
     """Sums of cells with the element that are constant, or change in one direction only."""
-    for key, verdict in (("constant_sums", "is constant"), ("never_falls", "never falls"), ("never_rises", "never rises")):
+    for key, verdict in (
+        ("constant_sums", "is constant"),
+        ("never_falls", "never falls"),
+        ("never_rises", "never rises"),
+    ):
         for elements in facts[key]:
             if name in elements:
-                words = " + ".join(elements) if len(elements) < len(facts["elements"]) else "the number of all cells"
+                words = (
+                    " + ".join(elements)
+                    if len(elements) < len(facts["elements"])
+                    else "the number of all cells"
+                )
                 yield f"{words} {verdict}"
 
 
@@ -181,21 +222,47 @@ def element_film(name: str, ruleset: str, facts: Any) -> bytes:
     known = next(entry for entry in facts["elements"] if entry["name"] == name)
     names = [entry["name"] for entry in facts["elements"]]
     if "wall" not in names:
-        return command("run", ruleset, "--size", "36x54", "--steps", "120", "--every", "2", "--scale", "6", out=".gif")
+        return command(
+            "run", ruleset, "--size", "36x54", "--steps", "120", "--every", "2", "--scale", "6", out=".gif"
+        )
     needed = [other for i in range(len(facts["rules"])) for other in partners(facts["rules"][i], name)]
-    others = [other for other in dict.fromkeys([*needed, *known["made_from"], *known["becomes"]]) if other not in ("empty", "wall", name)]
+    others = [
+        other
+        for other in dict.fromkeys([*needed, *known["made_from"], *known["becomes"]])
+        if other not in ("empty", "wall", name)
+    ]
     columns = [4, 14, 36, 46]
-    draw = [f"box {other} rows 24:32 columns {at}:{at + 6}" for other, at in zip(others, columns, strict=False)]
+    draw = [
+        f"box {other} rows 24:32 columns {at}:{at + 6}" for other, at in zip(others, columns, strict=False)
+    ]
     scene = {
         "scene": "film",
         "size": [36, 54],
         "fill": "empty",
-        "draw": ["frame wall", "box wall rows 32:36", *draw, f"disk {name} at (14, 27) radius 5", f"box {name} rows 28:32 columns 10:44"],
+        "draw": [
+            "frame wall",
+            "box wall rows 32:36",
+            *draw,
+            f"disk {name} at (14, 27) radius 5",
+            f"box {name} rows 28:32 columns 10:44",
+        ],
     }
     CACHE.mkdir(exist_ok=True)
     path = CACHE / f"{ruleset}-{name}.yaml"
     path.write_text(json.dumps(scene))  # JSON is YAML
-    return command("run", ruleset, "--world", str(path.relative_to(ROOT)), "--steps", "160", "--every", "2", "--scale", "6", out=".gif")
+    return command(
+        "run",
+        ruleset,
+        "--world",
+        str(path.relative_to(ROOT)),
+        "--steps",
+        "160",
+        "--every",
+        "2",
+        "--scale",
+        "6",
+        out=".gif",
+    )
 
 
 def partners(rule: Mapping[str, Any], name: str) -> list[str]:
@@ -214,11 +281,16 @@ def task_pages(pictures: bool) -> Iterator[tuple[str, str | bytes]]:
         task = load_task(name)
         shown = json_of("show", name)
         rows.append([f"[{name}]({name}.md)", task.family, task.about])
-        parts = [f"# {name}\n\n{task.about} Rules: `{shown['rules']}`; [the task's file](../../tasks/{name}.yaml)."]
+        parts = [
+            f"# {name}\n\n{task.about} Rules: `{shown['rules']}`; [the task's file](../../tasks/{name}.yaml)."
+        ]
         expert = bool(task.expert)
         if pictures:
             policy = "expert" if expert else "random"
-            yield f"tasks/{name}.gif", command("watch", name, "--policy", policy, "--worlds", "2", "--scale", "4", out=".gif")
+            yield (
+                f"tasks/{name}.gif",
+                command("watch", name, "--policy", policy, "--worlds", "2", "--scale", "4", out=".gif"),
+            )
             actor = "The expert" if expert else "Random actions"
             parts.append(f"![{actor} in two worlds]({name}.gif)\n\n{actor} in two held-out worlds.")
         splits = [[code(split["name"]), split["about"]] for split in shown["splits"]]
@@ -226,7 +298,10 @@ def task_pages(pictures: bool) -> Iterator[tuple[str, str | bytes]]:
         if pictures:
             parts.append(f"## Difficulty\n\n{difficulty(name, expert)}")
         if shown["knobs"]:
-            knobs = [[code(knob["name"]), str(knob["value"]), "{}..{}".format(*knob["range"]), knob["about"]] for knob in shown["knobs"]]
+            knobs = [
+                [code(knob["name"]), str(knob["value"]), "{}..{}".format(*knob["range"]), knob["about"]]
+                for knob in shown["knobs"]
+            ]
             parts.append(f"## Knobs\n\n{table(['knob', 'default', 'range', 'meaning'], knobs)}")
         yield f"tasks/{name}.md", "\n\n".join(parts) + "\n"
     head = "# Shipped tasks\n\nAll tasks that come with powderdsl. [Tasks](../tasks.md) explains how to write one.\n\n"
@@ -258,20 +333,28 @@ def share(success: Any) -> float:
 
 
 def reference_pages() -> Iterator[tuple[str, str]]:
-    commands = ["# Commands\n\nThe help of each command. [Command line](shell.md) explains what all commands share.\n"]
+    commands = [
+        "# Commands\n\nThe help of each command. [Command line](shell.md) explains what all commands share.\n"
+    ]
     for group, names in GROUPS.items():
         commands.append(f"## {group}\n")
         for name, summary in names.items():
-            commands.append(f"### powderdsl {name}\n\n{summary}\n\n```text\n{command(name, '--help').decode().strip()}\n```\n")
+            commands.append(
+                f"### powderdsl {name}\n\n{summary}\n\n```text\n{command(name, '--help').decode().strip()}\n```\n"
+            )
     yield "commands.md", "\n".join(commands)
 
-    codes = ["# Diagnostics\n\nAll mistakes that powderdsl reports, as `powderdsl explain CODE` prints them.\n"]
+    codes = [
+        "# Diagnostics\n\nAll mistakes that powderdsl reports, as `powderdsl explain CODE` prints them.\n"
+    ]
     for path in sorted((ROOT / "powderdsl/diagnostics/pages").glob("PD*.md")):
         text = path.read_text(encoding="utf-8")
         codes.append(re.sub(r"^(```\w*) (?:wrong|right).*$", r"\1", "#" + text, flags=re.MULTILINE))
     yield "diagnostics.md", "\n".join(codes)
 
-    parts = ["# Python API\n\nThe public classes and functions. [Python, a tour](python.md) shows them at work.\n"]
+    parts = [
+        "# Python API\n\nThe public classes and functions. [Python, a tour](python.md) shows them at work.\n"
+    ]
     for title, names in API.items():
         parts += [f"## {title}\n", *(f"::: powderdsl.{name}\n" for name in names)]
     yield "api.md", "\n".join(parts)
