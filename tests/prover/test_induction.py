@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
+from typing import Any
+
 import pytest
 
 from powderdsl.compiler import load
 from powderdsl.model.text import one_line
 from powderdsl.model.types import Ruleset
 from powderdsl.prover.induction import Prover
-from powderdsl.prover.solver import OutOfWork
+from powderdsl.prover.solver import OutOfWork, Solver
 from powderdsl.prover.symbolic import Budget, Evaluation, Undecided, deep_recursion
 from tests.semantics.texts import load_text
 
@@ -224,3 +227,31 @@ def test_no_formula_is_made_once_the_budget_is_spent(monkeypatch: pytest.MonkeyP
         monkeypatch.setattr(Evaluation, "value", pytest.fail)
         with pytest.raises(OutOfWork):
             prover.broken(ruleset.invariants[0].claim)
+
+
+@pytest.mark.parametrize("rules", SMALL)
+def test_formulas_of_proofs_against_python_sat(rules: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    solvers = pytest.importorskip("pysat.solvers", reason="python-sat is not installed")
+    answers = []
+
+    class Compared(Solver):
+        """A solver that gives all its clauses and questions to python-sat too."""
+
+        def __init__(self) -> None:
+            super().__init__()
+            self.other = solvers.Cadical153()
+
+        def add_clause(self, literals: Iterable[int]) -> None:
+            clause = list(literals)
+            self.other.add_clause(clause)
+            super().add_clause(clause)
+
+        def solve(self, assumptions: Sequence[int] = (), **options: Any) -> bool:
+            answer = super().solve(assumptions, **options)
+            assert answer == self.other.solve(assumptions=list(assumptions))
+            answers.append(answer)
+            return answer
+
+    monkeypatch.setattr("powderdsl.prover.questions.Solver", Compared)
+    verdicts(load(rules))
+    assert answers
