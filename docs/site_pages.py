@@ -33,6 +33,7 @@ from powderdsl.tasks.shipped import load_task, shipped_tasks
 
 ROOT = Path(__file__).resolve().parents[1]
 CACHE = ROOT / ".site"
+SHIM = "assets/javascripts/iframe-worker.js"
 COPIED = {"index.md": "README.md", "changelog.md": "CHANGELOG.md", "contributing.md": "CONTRIBUTING.md"}
 LINK = re.compile(r"(\]\()([^)\s#:]+)(#[^)\s]*)?(\))")
 FENCED = re.compile(r"^```.*?^```$", re.MULTILINE | re.DOTALL)
@@ -403,3 +404,15 @@ def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Fil
             pieces.append(block[0])
             end = block.end()
     return "".join(pieces)
+
+
+def on_post_page(output: str, page: Page, config: MkDocsConfig) -> str:
+    """Load the shim by which the search works in pages opened as files from the site itself, not from elsewhere."""
+    leads = os.path.relpath(SHIM, PurePosixPath(page.file.dest_uri).parent).replace(os.sep, "/")
+    return output.replace("https://unpkg.com/iframe-worker/shim", leads)
+
+
+def on_post_build(config: MkDocsConfig) -> None:
+    """Copy that shim; without what `make web` fetches, the search works where the site is served."""
+    fetched = ROOT / "tests/web/node_modules/iframe-worker/shim/index.js"
+    Path(config.site_dir, SHIM).write_bytes(fetched.read_bytes() if fetched.exists() else b"")
