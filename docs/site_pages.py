@@ -392,7 +392,7 @@ def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Fil
             kind = "tree" if (ROOT / target).is_dir() else "blob"
             if not (ROOT / target).exists():
                 return match[0]  # dead: MkDocs warns
-            leads = f"{config.repo_url}/{kind}/main/{target}"
+            leads = f"{config.extra["repository"]}/{kind}/main/{target}"
         return f"{match[1]}{leads}{match[3] or ''}{match[4]}"
 
     pieces = []

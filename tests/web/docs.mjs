@@ -1,6 +1,6 @@
 // The built documentation: node docs.mjs ADDRESS FOLDER QUESTIONS.json
 // Pictures go to FOLDER. Prints, as JSON, what axe finds, pages that are wider than the screen, and the first three
-// results of the search for each question.
+// pages that the search finds for each question.
 import { readFileSync } from "node:fs";
 import { join } from "node:path";
 import { fileURLToPath } from "node:url";
@@ -32,13 +32,19 @@ for (const colorScheme of ["light", "dark"])
 
 const page = await browser.newPage({ viewport: { width: 1440, height: 900 } });
 await page.goto(`${address}index.html`);
+const query = page.locator(".md-search__input").first();
+await query.click();
 for (const { ask } of JSON.parse(questions)) {
-  await page.locator(".md-search__input").first().click();
-  await page.locator(".md-search__input").first().fill(ask);
-  // Results replace the former ones once the worker has answered.
-  await page.waitForTimeout(600);
-  await page.locator(".md-search-result__meta").first().waitFor();
-  report.answers[ask] = await page.locator(".md-search-result__item > .md-search-result__link").evaluateAll((links) => links.slice(0, 3).map((link) => link.href));
+  await query.fill("");
+  const state = (empty) =>
+    page.waitForFunction((empty) => document.querySelector(".md-search-result__meta").textContent.includes("Type to start") === empty, empty, { timeout: 60_000 });
+  await state(true);
+  await query.pressSequentially(ask);
+  await state(false);
+  await page.waitForTimeout(500); // the last words of the question
+  report.answers[ask] = await page
+    .locator(".md-search-result__item")
+    .evaluateAll((pages) => pages.slice(0, 3).map((page) => page.querySelector("a").href));
 }
 await browser.close();
 console.log(JSON.stringify(report));
