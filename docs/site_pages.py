@@ -315,7 +315,13 @@ def difficulty(name: str, expert: bool) -> str:
     # Universes are compiled one by one, which WebAssembly does in less time.
     varied = any(split.rulesets for split in load_task(name).splits)
     episodes = "16" if varied else "64"
-    options = ["--episodes", episodes, "--policies", ",".join(policies), *(["--backend", "wasm"] if varied else [])]
+    options = [
+        "--episodes",
+        episodes,
+        "--policies",
+        ",".join(policies),
+        *(["--backend", "wasm"] if varied else []),
+    ]
     splits = json_of("evaluate", name, *options)["splits"]
     rows = []
     for split, results in splits.items():
@@ -392,7 +398,7 @@ def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Fil
             kind = "tree" if (ROOT / target).is_dir() else "blob"
             if not (ROOT / target).exists():
                 return match[0]  # dead: MkDocs warns
-            leads = f"{config.extra["repository"]}/{kind}/main/{target}"
+            leads = f"{config.extra['repository']}/{kind}/main/{target}"
         return f"{match[1]}{leads}{match[3] or ''}{match[4]}"
 
     pieces = []
