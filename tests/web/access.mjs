@@ -45,7 +45,13 @@ for (const colorScheme of ["light", "dark"])
   for (const [width, height] of SIZES) {
     const where = `${width} ${colorScheme}`;
     const phone = width < 700 || height < 500;
-    const page = await open({ viewport: { width, height }, colorScheme, hasTouch: phone, isMobile: phone });
+    const page = await open({ viewport: { width, height }, colorScheme, tour: true, hasTouch: phone, isMobile: phone });
+    await page.locator("#tour").waitFor();
+    for (const step of [1, 2, 3]) {
+      await check(page, `${where} tour ${step}`, "#tour");
+      await page.screenshot({ path: join(folder, `${width}-${colorScheme}-tour-${step}.png`) });
+      await page.locator("#tour button").first().click();
+    }
     for (const panel of PANELS) {
       if (panel !== "rules-panel" || phone) await page.locator(`[data-panel=${panel}]`).click();
       if (panel === "gallery") await page.locator(".card").first().waitFor();
@@ -85,14 +91,6 @@ for (const colorScheme of ["light", "dark"])
     if (await page.evaluate(() => document.documentElement.scrollWidth > innerWidth)) seen.wide.push(where);
     await page.screenshot({ path: join(folder, `${width}-${colorScheme}.png`) });
     await page.context().close();
-    const first = await open({ viewport: { width, height }, colorScheme, tour: true, hasTouch: phone, isMobile: phone });
-    await first.locator("#tour").waitFor();
-    for (const step of [1, 2, 3]) {
-      await check(first, `${where} tour ${step}`, "#tour");
-      await first.screenshot({ path: join(folder, `${width}-${colorScheme}-tour-${step}.png`) });
-      await first.locator("#tour button").first().click();
-    }
-    await first.context().close();
   }
 for (const colorScheme of ["light", "dark"]) {
   const landing = await open({ viewport: { width: 390, height: 844 }, colorScheme }, "");

@@ -71,7 +71,7 @@ function prepare() {
     } else if (target.type === "number") {
       target.value = one(["0", "7", "-1", "1e9", "99999999999", "1.5", "", "200"]);
       event(target, "input", "change");
-    } else if (target.matches("input:not([type=checkbox])")) {
+    } else if (target.matches("input:not([type=checkbox], [type=color])")) {
       target.value = one(NAMES);
       target.blur();
     } else target.click();

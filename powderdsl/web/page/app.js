@@ -123,8 +123,9 @@ async function begin() {
   }
   await import("./compiler.js"); // its worker loads beside the editor
   await Promise.all([import("./panels.js"), import("./rules.js")]);
-  await Promise.all([import("./exchange.js"), import("./checks.js"), import("./elements.js"), import("./tasks.js")]);
+  await Promise.all([import("./exchange.js"), import("./checks.js"), import("./elements.js")]);
   if (!embedded && !app.isBack && !location.hash && !toured()) await import("./tour.js");
+  await import("./tasks.js"); // its files are large
   await addWorlds(await (await get("tasks.json")).json());
   if (app.catalog.offline) navigator.serviceWorker?.register("sw.js").catch(() => {}); // private windows may refuse
 }

@@ -85,7 +85,7 @@ function mark(context, scale, cell) {
       if (!cells[at + columns]) line([x, y + 1], [x + 1, y + 1]);
     });
     const first = cells.indexOf(1);
-    context.fillText(name, ((first % columns) + 0.5) * scale, Math.floor(first / columns) * scale - 4);
+    context.fillText(name, ((first % columns) + 0.5) * scale, Math.max(14, Math.floor(first / columns) * scale - 4));
   }
   context.stroke();
   if (!cell) return;
