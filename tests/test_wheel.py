@@ -23,9 +23,8 @@ def test_wheel_holds_what_ships(wheel: Path) -> None:
     with zipfile.ZipFile(wheel) as archive:
         inside = {name: archive.read(name) for name in archive.namelist()}
     data = {f"powderdsl/data/{name}": text for name, text in (shipped("rules") | shipped("tasks")).items()}
-    data |= {
-        name.replace("docs", "powderdsl/data", 1): text for name, text in shipped("docs/examples").items()
-    }
+    pages = shipped("docs/examples") | {"docs/short.md": (ROOT / "docs" / "short.md").read_bytes()}
+    data |= {name.replace("docs", "powderdsl/data", 1): text for name, text in pages.items()}
     package = {name: text for name, text in shipped("powderdsl").items() if "__pycache__" not in name}
     assert data, "nothing ships"
     assert {name for name in inside if ".dist-info/" not in name} == data.keys() | package.keys()
