@@ -198,14 +198,12 @@ def stages() -> str:
 def planner() -> str:
     from powderdsl.schedule.stages import PLANNERS
 
-    names = dict.fromkeys(stage.name for stages in PLANNERS.values() for stage in stages)
-    rows = []
-    for name in names:
-        found = {
-            target: stage for target, stages in PLANNERS.items() for stage in stages if stage.name == name
-        }
-        rows.append((f"`{name}`", next(iter(found.values())).about, ", ".join(found)))
-    return table(("stage", "what it decides", "for"), rows)
+    stages = {stage.name: stage for planner in PLANNERS.values() for stage in reversed(planner)}
+    names = dict.fromkeys(stage.name for planner in PLANNERS.values() for stage in planner)
+    rows = (
+        (f"`{name}`", stages[name].about.partition(";")[0]) for name in names
+    )  # reasons for the order left out
+    return table(("stage", "what it decides"), rows)
 
 
 def commands() -> str:
