@@ -36,19 +36,17 @@ class SceneDecl(Record, noun="a scene"):
     """A scene as written."""
 
     name: str = keyed("the scene's name", "", name="scene", required=True, form=NAME_FORM)
-    about: str = keyed("what it shows, in a sentence", "")
+    about: str = keyed("its purpose, in a sentence", "")
     size: yaml_tree.Node | None = keyed("[rows, columns]", required=True)
-    fill: yaml_tree.Scalar | None = keyed(
-        "the element that is everywhere before anything is drawn", required=True
-    )
-    draw: yaml_tree.Node | None = keyed("statements, one a line, later ones over earlier ones")
+    fill: yaml_tree.Scalar | None = keyed("the element that fills the world first", required=True)
+    draw: yaml_tree.Node | None = keyed("statements, in order")
 
 
 class FileDecl(Record, noun="a file of scenes"):
     """A file with several scenes."""
 
     scenes: yaml_tree.Node | None = keyed("the scenes of the file", required=True, shape="list")
-    about: str = keyed("what they are for, in a sentence", "")
+    about: str = keyed("their purpose, in a sentence", "")
 
 
 SIZE_RULE = f"a world has at least one row and one column, and at most {MAX_CELLS:,} cells"
