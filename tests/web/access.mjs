@@ -61,8 +61,8 @@ for (const colorScheme of ["light", "dark"])
       if (phone && colorScheme === "light") seen.small[`${where} ${panel}`] = await small(page);
     }
     if (phone) {
-      await page.locator("[data-panel=gallery]").click(); // closes the sheet
-      await page.locator(".card").first().waitFor({ state: "hidden" });
+      await page.locator("[data-panel=tasks]").click(); // closes the sheet
+      await page.locator("#tasks table").waitFor({ state: "hidden" });
       seen.reach[where] = await page.evaluate(() => ["canvas", "run", "elements", "tool", "tabs"].filter((id) => {
         const { top, bottom, left } = document.getElementById(id).getBoundingClientRect();
         return top < 0 || left < 0 || left + 40 > innerWidth || (id === "elements" && innerHeight < 500 ? top + 84 : bottom) > innerHeight;

@@ -3,6 +3,7 @@
 import { $, fill, make } from "./dom.js";
 import { addFile, goTo, linesOf, rules } from "./rules.js";
 import { app } from "./state.js";
+import { showPanel } from "./tabs.js";
 
 /** How new elements move, in words, and what says so where the rules have gravity. */
 const MOVES = {
@@ -40,6 +41,7 @@ function showMentions() {
   const head = make("div", { class: "row" }, make("strong", { class: "grow" }, `Lines about ${name} and its tags`), close);
   $("mentions").replaceChildren(head, ...(rows.length ? rows : [make("p", { class: "soft" }, "No line names it.")]));
   $("mentions").hidden = false;
+  showPanel("rules-panel");
   rows[0]?.click();
   rows[0]?.focus();
 }
