@@ -1,7 +1,8 @@
-"""Physics as data, compiled to tensor kernels, trained on.
+"""Write the rules of pixel worlds in YAML; check, run and train on them.
 
-`load` reads rules, and `compile` makes a `Simulator` of them, which makes, changes and steps a `World`. `load_world` reads
-worlds and scenes, `save` stores worlds, and `gif` films them. `ledger` says what rules create, destroy and move. `CompileError` has the mistakes in files.
+`load` reads rules, and `compile` turns them into a `Simulator`, which creates, changes and steps a `World`.
+`load_world` reads worlds and scenes, `save` stores worlds, and `gif` writes animations. `ledger` reports what rules
+create, destroy and move. `CompileError` lists the mistakes in files.
 """
 
 from __future__ import annotations

@@ -30,16 +30,16 @@ if TYPE_CHECKING:
     from powderdsl.model.composition.compose import Palette
 
 BACKENDS = {
-    "auto": "`wasm` at once, and `native` once that is compiled; `cuda`, or else `torch`, on other devices",
-    "torch": "torch tensors of 64 cells a word, on any device",
-    "torch-cells": "torch tensors of one element a cell, on any device: the readable one",
-    "torch-fused": "the functions of `torch`, compiled by torch's inductor, which takes minutes; then kept",
-    "wasm": "generated WebAssembly, run by wasmtime on the CPU: starts at once, needs no compiler",
-    "native": "generated C++ for the CPU; compiled once, then kept",
-    "cuda": "generated CUDA C++ for a GPU: whole worlds on the chip, all steps of a call in one launch",
-    "reference": "the slow oracle in NumPy that defines what rules mean",
+    "auto": "`wasm` first, and `native` once it is compiled; `cuda`, or else `torch`, on other devices",
+    "torch": "torch tensors with 64 cells per word, on any device",
+    "torch-cells": "torch tensors with one value per cell, on any device; its code is the easiest to read",
+    "torch-fused": "the functions of `torch`, compiled by torch's inductor, which takes minutes, and cached",
+    "wasm": "generated WebAssembly, run by wasmtime on the CPU; starts instantly, needs no compiler",
+    "native": "generated C++ for the CPU; compiled once and cached",
+    "cuda": "generated CUDA C++ for a GPU; whole worlds stay on the chip, and a call takes one launch",
+    "reference": "the slow reference in NumPy that defines what rules mean",
 }
-"""All of them give the same worlds, bit for bit."""
+"""Backends by name. All of them compute the same worlds, bit for bit."""
 
 MAX_BASES = 8
 """Maximum length of a chain of rulesets that extend each other."""
@@ -49,7 +49,7 @@ MAX_PLUSES = 16
 
 
 def shipped_rules() -> list[str]:
-    """Names of the packs and rulesets that come with powderdsl."""
+    """Names of the shipped packs and rulesets."""
     return shipped_names("rules")
 
 
@@ -85,7 +85,7 @@ def shipped_variants() -> set[str]:
 
 
 def shipped_tests() -> list[str]:
-    """The shipped rules that load alone: rulesets, and packs that need no other pack and belong to no ruleset."""
+    """The shipped rules that load alone: rulesets, and packs that neither need another pack nor belong to a ruleset."""
     decls = [decl for source in _shipped_sources() if (decl := _read_once(source)[0])]
     inside = {scalar.text for decl in decls if isinstance(decl, RulesetDecl) for scalar in decl.packs}
     return [
@@ -104,15 +104,15 @@ def load(
         names: shipped names (``"powderworld"``), paths of rule files, or several joined by ``+``. A name after ``-``
             is left out: ``"name-pack"``.
         params: values that replace the defaults of parameters, by qualified name: ``{"pack.param": 0.05}``.
-        palette: recorded ids, such as a model's: the qualified name of the element of each id, or None. Other elements
-            get its free ids, then the ids after its end.
+        palette: recorded ids, such as those of a model: for each id the qualified name of its element, or None. Other
+            elements get the free ids of the palette, then ids after its end.
 
     Returns:
         The checked model, which `powderdsl.compile` takes.
 
     Raises:
         CompileError: all mistakes in the files; PD304 for an unknown name, PD101 or PD102 for a file that cannot be
-            read, PD309 for an unknown parameter, PD402 for a value that it cannot have.
+            read, PD309 for an unknown parameter, PD402 for a value out of its range.
         TypeError: `params` is not a mapping.
     """
     ruleset, _ = load_with_diagnostics(*names, params=params, palette=palette)
@@ -152,7 +152,7 @@ def load_with_diagnostics(
 
 
 def load_with_claim(name: str, claim: str) -> Ruleset:
-    """Read rule files into a checked model whose only invariant is a claim. Raises CompileError, as `load` does."""
+    """Read rule files into a checked model whose only invariant is `claim`. Raises CompileError, as `load` does."""
     from powderdsl.model.check import check
 
     reporter = Reporter()
@@ -169,7 +169,7 @@ def load_with_claim(name: str, claim: str) -> Ruleset:
 
 
 CLAIM = "command_line"
-"""The name of the pack of a claim that no file makes."""
+"""The name of the pack that contains a claim without a file."""
 
 
 def _report_more(
@@ -193,11 +193,11 @@ def _report_more(
 
 
 INDEPENDENT = re.compile("PD(108|110|301|311|40[12357]|406|409|410)")
-"""The errors in rules and values, which follow from an earlier one only if they name what could not be read."""
+"""The errors in rules and values, without those that name something that could not be read."""
 
 
 def whole_palette(*names: str | Path) -> tuple[str | None, ...]:
-    """The slots of a model for the elements of some rules: a qualified name or None each.
+    """The slots of a model for the elements of some rules, each a qualified name or None.
 
     Packs that are left out have slots too. The ids of a ruleset's own packs, or of a list of packs, do not change; the
     elements of packs that are added to a ruleset follow without gaps. Raises CompileError as `load`.
@@ -299,10 +299,10 @@ def _read_apart(source: Source) -> tuple[PackDecl | RulesetDecl | None, tuple[Di
 
 
 SMALL = 1 << 16
-"""The most characters of files whose declarations are cached; larger files take much memory."""
+"""Maximum size in characters of files whose declarations are cached; larger ones take too much memory."""
 
 _read_once = lru_cache(maxsize=128)(_read_apart)
-"""Tasks, tests and environments load the same packs again and again."""
+"""A cache, since tasks, tests and environments load the same packs repeatedly."""
 
 
 class _Reader:
@@ -347,7 +347,7 @@ class _Reader:
         return list(loaded.values()), replace(last, beside=tuple(beside), left_out=reserved)
 
     def needed_by(self, loaded: Mapping[str, PackDecl], left_out: Collection[str]) -> dict[str, PackDecl]:
-        """The packs that others need and that nobody named or left out, from files beside those or shipped."""
+        """The required packs that were neither named nor left out, from files in the same folder or shipped."""
         needed: dict[str, PackDecl] = {}
         waiting = list(loaded.values())
         known = {
@@ -406,7 +406,7 @@ class _Reader:
                 self.read(member, lister)
 
     def with_base(self, decl: RulesetDecl, path: tuple[RulesetDecl, ...]) -> RulesetDecl | None:
-        """The ruleset with its base; `path` has the rulesets from the first one to this one."""
+        """The ruleset with its base; `path` lists the rulesets from the first one to this one."""
         reporter = self.reporter
         if decl.extends is None:
             return decl
@@ -447,7 +447,7 @@ class _Reader:
 
 
 def _find(word: str, reporter: Reporter, ruleset: RulesetDecl | None) -> Path | Source | None:
-    """A file by path or shipped name, or a universe; packs of a ruleset lie beside its file or are shipped."""
+    """A file by path or shipped name, or a universe; packs of a ruleset are in its folder or shipped."""
     span = next((s.span for s in ruleset.packs if s.text == word), None) if ruleset else None
     if is_universe(word):
         return universe_source(word, span, reporter)

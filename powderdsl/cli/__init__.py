@@ -1,4 +1,4 @@
-"""The command line. A command's module is imported when it is called, torch when a world runs."""
+"""The command line. A command's module is imported when the command is called; torch, when a world runs."""
 
 from powderdsl.cli.dispatch import main
 

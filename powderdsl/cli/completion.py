@@ -1,4 +1,4 @@
-"""Completion in shells: names that come with powderdsl, for parameters whose metavar or name says what they take."""
+"""Shell completion of shipped names, for parameters whose metavar or name tells what they take."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from powderdsl.worlds.scene.read import shipped_scenes
 
 
 def _splits(args: Sequence[str]) -> Iterable[str]:
-    """The splits of the task, or of the run's task, that stands before the option."""
+    """The splits of the task, or of the run's task, named before the option."""
     with suppress(CompileError, LookupError):
         task = args[0] if is_task(args[0]) else find_run(args[0]).config["task"]
         return [split.name for split in load_task(task).splits]
@@ -35,11 +35,11 @@ NAMES = {
     "CODE": ("\0", lambda args: CODES),
     "SPLIT": (",", _splits),
 }
-"""What completes a parameter, by a word of its metavar or name, and characters behind which another name follows."""
+"""Completions of a parameter, by a word of its metavar or name, and the characters that separate names."""
 
 
 def add_completion(command: click.Command) -> None:
-    """Let names complete the parameters of a command, and of those below it."""
+    """Complete the parameters of a command and its subcommands by names."""
     for param in command.params:
         words = re.findall("[A-Z]+", f"{param.metavar} {param.name}".upper())
         if known := [word for word in NAMES if word in words]:

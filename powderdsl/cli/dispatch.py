@@ -1,4 +1,4 @@
-"""The group of commands. Names and summaries stand in one table, so that `--help` imports nothing else."""
+"""The group of commands. One table has the names and summaries, so that `--help` imports nothing else."""
 
 from __future__ import annotations
 
@@ -22,34 +22,34 @@ GROUPS = {
     "Start": {
         "new": "Create a starter pack: an element, a rule and a test.",
         "run": "Run a world: watch it, or write a picture or an animation.",
-        "play": "Open a page to paint worlds and to change their rules while they run.",
+        "play": "Open a page to paint worlds and change their rules while they run.",
         "render": "Draw a world as a picture, without running it.",
     },
     "Rules": {
         "check": "Find all mistakes in rule files and tasks at once.",
         "test": "Run the tests of packs and check their invariants.",
-        "prove": "Prove that two rulesets do the same, or that a claim always holds.",
+        "prove": "Prove that two rulesets are equivalent, or that a claim always holds.",
         "trace": "Explain a cell: which rule wrote it, and what the rule read.",
         "show": "List elements, reactions, passes and parameters, or describe a task.",
-        "universe": "Print the rule pack of a seed: invented elements and laws.",
-        "fmt": "Give YAML files one layout, comments included.",
+        "universe": "Print the rule pack generated from a seed: invented elements and laws.",
+        "fmt": "Format YAML files, keeping comments.",
         "schema": "Print the JSON Schema of all files, for editors.",
         "lsp": "Run a language server for editors.",
         "explain": "Explain a diagnostic code and how to fix it.",
         "compile": "Print the output of a compiler stage.",
-        "bench": "Measure how fast rules run, on each backend, batch and size.",
+        "bench": "Measure how fast rules run on each backend, batch and world size.",
         "export": "Write rules as a WebAssembly module, or a task as a C header.",
         "cache": "List or remove cached compiled code.",
     },
     "Learn": {
         "train": "Train an agent on a task, or resume an interrupted run.",
         "evaluate": "Compare an agent with a random policy and with doing nothing.",
-        "watch": "Record a film of an agent at its task.",
-        "curves": "Draw learning curves of runs, with intervals over seeds.",
-        "record": "Record episodes of a task: data for offline learning and world models.",
+        "watch": "Record a video of an agent at its task.",
+        "curves": "Plot learning curves of runs, with confidence intervals over seeds.",
+        "record": "Record episodes of a task for offline learning and world models.",
         "wm": "World models: train, test and fine-tune networks that predict worlds.",
-        "study": "Run training over many settings and seeds, and compare the results.",
-        "ogbench": "Collect the data sets of OGBench's Powderworld.",
+        "study": "Train over many settings and seeds, and compare the results.",
+        "ogbench": "Collect the datasets of OGBench's Powderworld.",
     },
 }
 COMMANDS = {name: summary for group in GROUPS.values() for name, summary in group.items()}
@@ -59,7 +59,7 @@ _usual = warnings.formatwarning
 
 
 def plain_warning(message: Warning | str, category: type[Warning], *rest: Any, **options: Any) -> str:
-    """The text of a warning: our own in a sentence, others with the line that they come from."""
+    """The text of a warning: our own as one sentence, others with the line that raised them."""
     from powderdsl.targets.cpp.build import NoCompilerWarning
 
     if issubclass(category, NoCompilerWarning):
@@ -68,26 +68,26 @@ def plain_warning(message: Warning | str, category: type[Warning], *rest: Any, *
 
 
 class GuardedCommand(click.Command):
-    """Turns every failure into an exit code."""
+    """A command that turns every failure into an exit code."""
 
     def main(
         self, args: Sequence[str] | None = None, prog_name: str | None = None, *rest: Any, **options: Any
     ) -> NoReturn:
         """Run a command and exit with one of the codes of `exits`."""
         for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
-            if getattr(sys, name) is None:  # closed (`>&-`); no file of ours may take its number
+            if getattr(sys, name) is None:  # closed (`>&-`): keep our files from getting its number
                 setattr(sys, name, open(os.devnull, mode, encoding="utf-8"))  # noqa: SIM115 until the end
-        # A terminal that lacks a character shows a `?` in its place.
+        # A character that the terminal cannot show becomes a `?`.
         for stream in (sys.stdout, sys.stderr):
             if hasattr(stream, "reconfigure"):
                 stream.reconfigure(errors="replace")
-        # What commands make stays alive: searching it for cycles took a tenth of their time.
+        # Objects of commands stay alive: searching them for cycles took a tenth of the run time.
         gc.set_threshold(100_000)
         options["standalone_mode"] = False
         warnings.formatwarning = plain_warning
         if os.environ.pop(LIFELINE, None):
             end_with_stdin()
-        # For completion, click writes bytes that a shell reads: names of ours, and nothing from files.
+        # For completion, click writes bytes to a shell: only our own names, nothing from files.
         completes = "_POWDERDSL_COMPLETE" in os.environ
         with nullcontext() if completes else printable_streams(), interruptible():
             try:
@@ -98,7 +98,7 @@ class GuardedCommand(click.Command):
 
 
 class CommandGroup(GuardedCommand, click.Group):
-    """Imports commands late, and suggests one for an unknown name."""
+    """Import commands lazily, and suggest one for an unknown name."""
 
     def list_commands(self, ctx: click.Context) -> list[str]:
         return list(COMMANDS)
@@ -109,7 +109,7 @@ class CommandGroup(GuardedCommand, click.Group):
 
             ctx.fail(with_suggestion(f"no command `{cmd_name}`", cmd_name, COMMANDS, "commands"))
         command: click.Command = import_module(f"powderdsl.cli.commands.{cmd_name}").command
-        if ctx.resilient_parsing:  # a shell asks
+        if ctx.resilient_parsing:  # called by a shell
             from powderdsl.cli.completion import add_completion
 
             add_completion(command)
@@ -128,14 +128,13 @@ class CommandGroup(GuardedCommand, click.Group):
 )
 @click.version_option(version(), prog_name="powderdsl", message="%(prog)s %(version)s")
 def main() -> None:
-    """Physics as data, compiled to tensor kernels.
+    """Write the rules of pixel worlds in YAML; check, run and train on them.
 
-    RULES names rules everywhere: a shipped ruleset or pack, a rule file, or several of them joined by `+`;
-    packs after a `-` are left out.
+    RULES is always a shipped ruleset or pack, a rule file, or several of them joined by `+`; `-PACK` leaves a pack out.
 
     \b
         powderdsl run RULES --watch
         powderdsl new NAME && powderdsl check NAME.yaml
 
-    docs/shell.md lists environment variables, and says how shells complete words.
+    docs/shell.md lists environment variables and explains how to set up shell completion.
     """

@@ -1,4 +1,4 @@
-"""Endings of commands: exit codes, and messages about failures."""
+"""Exit codes of commands, and messages about failures."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from powderdsl.system.interrupts import Terminated
 
 OK = 0
 FAILED = 1
-"""The command ran, and its answer is no: a test failed, or a warning counts as an error."""
+"""The command ran, but the result is negative: a test failed, or a warning counts as an error."""
 BAD_INPUT = 2
 INTERNAL = 70
-"""A mistake in powderdsl itself (EX_SOFTWARE of sysexits.h)."""
+"""A bug in powderdsl (EX_SOFTWARE of sysexits.h)."""
 INTERRUPTED = 130
-"""Ctrl-C. Other signals that end a command give 128 and their number, as shells have it: 143 for SIGTERM."""
+"""Ctrl-C. For other signals the code is 128 plus the signal's number, as in shells: 143 for SIGTERM."""
 
 
 class BadInput(click.ClickException):
@@ -37,12 +37,12 @@ def version() -> str:
 
 
 PACKAGES = {"PIL": "pillow", "gymnasium": "'powderdsl[rl]'"}
-"""Packages by the module that they bring, where pip knows them by another name."""
+"""Names for pip of packages whose module has another name."""
 
 
 @contextmanager
 def user_values() -> Iterator[None]:
-    """Turn errors that the Python API raises for bad values into one line, where the values come from the user."""
+    """Turn errors that the Python API raises for the user's values into a message of one line."""
     try:
         yield
     except (ValueError, TypeError, LookupError) as error:
@@ -56,7 +56,7 @@ def report_failure(error: BaseException) -> int:
     from powderdsl.diagnostics import CompileError
 
     match error:
-        case click.Abort(__cause__=EOFError() as cause):  # click takes it for the end of what somebody types
+        case click.Abort(__cause__=EOFError() as cause):  # click takes it for the end of typed input
             _report_internal(cause)
             return INTERNAL
         case click.Abort(__cause__=Terminated() as ending) | (Terminated() as ending):
@@ -82,7 +82,7 @@ def report_failure(error: BaseException) -> int:
             file = f"{error.filename}: " if error.filename else ""
             click.echo(f"error: {file}{error.strerror or error}", err=True)
             return BAD_INPUT
-    # torch raises a RuntimeError of its own on every device.
+    # torch raises its own RuntimeError on every device.
     if isinstance(error, MemoryError) or (isinstance(error, RuntimeError) and "memory" in str(error)):
         click.echo("error: not enough memory: fewer or smaller worlds may fit", err=True)
         return BAD_INPUT
@@ -99,10 +99,10 @@ def _report_internal(error: BaseException) -> None:
     if os.environ.get("POWDERDSL_DEBUG") == "1":
         traceback.print_exception(error)
     words = " ".join([f"{type(error).__name__}:", *str(error).split()])[:300].rstrip(":")
-    message = f"a mistake in powderdsl itself: {words}"
+    message = f"a bug in powderdsl: {words}"
     system = f"powderdsl {version()}, Python {platform.python_version()}, {platform.system()}"
     helps = (
-        "please report it, with the command and the files it was given",
-        "POWDERDSL_DEBUG=1 shows where it happened",
+        "please report it with the command and its input files",
+        "set POWDERDSL_DEBUG=1 to see the traceback",
     )
     write_diagnostics([Diagnostic("PD901", message, Label(None), notes=(system,), helps=helps)], sys.stderr)

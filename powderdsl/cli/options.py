@@ -1,4 +1,4 @@
-"""Arguments and options of commands, and what their values mean. Commands import this module as `opt`."""
+"""Arguments and options of commands, and their types. Commands import this module as `opt`."""
 
 from __future__ import annotations
 
@@ -27,11 +27,11 @@ Option = Callable[[Any], Any]
 Presets = Mapping[str, Mapping[str, Any]] | None
 
 MAX_SIDE = 1 << 24
-"""Rows or columns of a world; `worlds` limits the number of cells."""
+"""Maximum of rows or columns of a world; `worlds` limits the number of cells."""
 
 
 class Parsed(click.ParamType):
-    """A value that a function makes of a text. The function raises ValueError with what is wrong with the text."""
+    """A value that a function parses from text. The function raises ValueError with a reason if the text is invalid."""
 
     def __init__(self, name: str, make: Callable[[str], Any]):
         self.name, self.make = name, make
@@ -44,7 +44,7 @@ class Parsed(click.ParamType):
 
 
 class Integer(click.IntRange):
-    """An integer in a range. Digits of other scripts, which Python reads and rule files do not have, are refused."""
+    """An integer in a range, in ASCII digits: Python would also accept those of other scripts."""
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
         if isinstance(value, str) and not value.isascii():
@@ -63,7 +63,7 @@ def _count(text: str) -> int:
 
 
 COUNT = Parsed("N", _count)
-"""An integer, also written as ``1e6`` or ``200_000``. The settings check whether it is in range."""
+"""An integer, which may be written ``1e6`` or ``200_000``. The settings check its range."""
 
 
 def _size(text: str) -> tuple[int, int]:
@@ -77,7 +77,7 @@ def _size(text: str) -> tuple[int, int]:
 
 
 SIZE = Parsed("HxW", _size)
-"""`48x64`: rows and columns; `64`: as many of both."""
+"""`48x64`: rows and columns; `64`: a square."""
 
 
 def _names(text: str) -> tuple[str, ...]:
@@ -95,9 +95,9 @@ def option(name: str, kind: Any, about: str, default: Any = None, *, to: str = "
     """An option of a command.
 
     Args:
-        kind: two integers for one in their range, words for one of them, `bool` for a flag, a metavar for any text, or a
-            type of click, such as SIZE.
-        to: the parameter of the command, where it has another name.
+        kind: two integers (a range), a list of words (a choice), `bool` (a flag), a metavar (any text), or a click
+            type, such as SIZE.
+        to: the command's parameter, if its name differs.
     """
     match kind:
         case str():
@@ -110,7 +110,7 @@ def option(name: str, kind: Any, about: str, default: Any = None, *, to: str = "
             more["is_flag"] = True
         case _:
             more["type"] = kind
-    if default is not None:  # click takes None for a value, which a required option then has
+    if default is not None:  # click would take None for the value of a required option
         more["default"] = default
     return click.option(name, *([to] if to else []), help=about, **more)
 
@@ -120,7 +120,7 @@ def path(name: str, metavar: str, about: str, **more: Any) -> Option:
 
 
 def output(name: str, metavar: str, about: str, *suffixes: str, **more: Any) -> Option:
-    """An option for a file to write, with one of some suffixes. Raises CompileError (PD613) before the command begins."""
+    """An option for an output file with one of `suffixes`. Raises CompileError (PD613) before the command begins."""
 
     def checked_path(text: str) -> Path:
         path = Path(text)
@@ -133,7 +133,7 @@ def output(name: str, metavar: str, about: str, *suffixes: str, **more: Any) -> 
 
 
 def pairs(name: str, metavar: str, about: str, to: str, value: str = ".+", read: type = str) -> Option:
-    """An option that may be repeated: values by name. `value` is a pattern of them, `read` what makes them of text."""
+    """A repeatable option that maps names to values. Values match the pattern `value` and are parsed by `read`."""
 
     def mapping(ctx: click.Context, param: click.Parameter, words: tuple[str, ...]) -> dict[str, Any]:
         values: dict[str, Any] = {}
@@ -152,7 +152,7 @@ def knobs(about: str) -> Option:
 
 
 def several(*options: Option) -> Option:
-    """A decorator that stands for some options, in their order."""
+    """A decorator that applies several options in order."""
 
     def decorate(function: Any) -> Any:
         for option in reversed(options):
@@ -165,8 +165,8 @@ def several(*options: Option) -> Option:
 def settings_of(config: type, presets: Presets = None, *, only: Sequence[str] = (), **names: str) -> Option:
     """An option for each field of a dataclass that has a help text (`system.settings`). Its default is None.
 
-    The settings themselves report values out of range, all mistakes together. `presets`: the settings that each changes,
-    for the help; None: a run has them. `only`: names of fields; unless given, all. `names`: other names of options.
+    The settings report all values out of range at once. `presets`: the settings that each preset changes, for the help;
+    None if defaults are the run's. `only`: names of fields (default: all). `names`: other names for options.
     """
     chosen = [field for field in fields(config) if not only or field.name in only]
     return several(*(_setting(field, names.get(field.name, ""), presets) for field in chosen))
@@ -195,7 +195,7 @@ def _setting(field: Field[Any], name: str, presets: Presets) -> Option:
 
 
 def given_options(values: Mapping[str, Any], names: Iterable[str]) -> dict[str, Any]:
-    """The values of some options, if they were given."""
+    """The values of the options in `names` that were given."""
     return {name: values[name] for name in names if values.get(name) not in (None, (), {})}
 
 
@@ -205,13 +205,13 @@ def given_settings(values: Mapping[str, Any], config: type, without: Sequence[st
 
 
 rules = click.argument("rules", metavar="RULES")
-"""RULES: what `powderdsl.load` takes."""
+"""RULES: an argument of `powderdsl.load`."""
 
 parameters = pairs(
-    "--set", "PACK.PARAM=VALUE", "Another value of a parameter, such as 5%. May be repeated.", "settings"
+    "--set", "PACK.PARAM=VALUE", "Set a parameter, such as to 5%. May be repeated.", "settings"
 )
-"""Names and values are checked later, with the model."""
-proof = option("--prove", (0, 24 * 3600), "Seconds of work for proofs: counted, not timed.", 60)
+"""Names and values are checked later, against the model."""
+proof = option("--prove", (0, 24 * 3600), "Effort for proofs, in nominal seconds (counted, not timed).", 60)
 world = option("--world", "FILE|NAME", "A .npz, .png, .txt or .yaml file, or the name of a scene.")
 size = option("--size", SIZE, "Rows and columns, such as 48x64.")
 device = click.option("--device", default="cpu", help="A torch device: cpu, cuda, cuda:1.")
@@ -234,11 +234,11 @@ SECTIONS = {
     "Output": "out watch scale every fps beside profile all json verbose",
     "Machine": "backend device threads store",
 }
-"""Names of options, by the section of the help that they stand in."""
+"""Names of options, by section of the help."""
 
 
 class Command(click.Command):
-    """A command whose help has its options in sections, if there are many; those that would stand alone are last."""
+    """A command whose help groups many options into sections; options without a group come last."""
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
         ctx.allow_extra_args = True
@@ -248,7 +248,7 @@ class Command(click.Command):
                 fix = f"join rules by `+`: {ctx.params['rules']}+{word}"
             elif "world" in ctx.params:
                 fix = f"name a start world by `--world {word}`"
-            raise BadInput(f"one argument too many, `{word}`: {fix}")
+            raise BadInput(f"unexpected argument `{word}`: {fix}")
         return rest
 
     def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
@@ -264,7 +264,7 @@ class Command(click.Command):
 
 
 def pack_list(name: str, about: str, read: Callable[[str], str] = str, **more: Any) -> Option:
-    """An option for packs, joined by commas; it may be repeated."""
+    """A repeatable option for packs, separated by commas."""
 
     def joined(ctx: Any, param: Any, lists: Sequence[Sequence[str]]) -> tuple[str, ...]:
         return tuple(read(pack) for packs in lists for pack in packs)
@@ -273,12 +273,12 @@ def pack_list(name: str, about: str, read: Callable[[str], str] = str, **more: A
 
 
 def _place(pack: str) -> str:
-    """A pack as runs record it: a file by its absolute path."""
+    """A pack as runs record it: files by absolute path."""
     return str(Path(pack).absolute()) if pack.endswith((".yaml", ".yml")) else pack
 
 
-packs = pack_list("--packs", "Packs, by name or file, that are added to the task's rules.", _place)
-task_options = several(knobs("Another value for a knob of a task. May be repeated."), parameters, packs)
+packs = pack_list("--packs", "Packs to add to the task's rules, by name or file.", _place)
+task_options = several(knobs("Set a knob of a task. May be repeated."), parameters, packs)
 
 
 BACKEND = click.Choice(list(BACKENDS))
@@ -292,7 +292,7 @@ machine = several(backend("auto"), device, option("--threads", (1, 1024), "CPU t
 
 
 def load_rules(rules: str, settings: dict[str, str]) -> Ruleset:
-    """The checked model of RULES with `--set` values. The number of warnings is printed on stderr."""
+    """Load RULES with `--set` values; print the number of warnings on stderr."""
     ruleset, remarks = load_with_diagnostics(rules, params=settings)
     warnings = sum(remark.severity is Severity.WARNING for remark in remarks)
     if warnings:
@@ -303,7 +303,7 @@ def load_rules(rules: str, settings: dict[str, str]) -> Ruleset:
 def find_played(
     name: str, knobs: dict[str, int], settings: dict[str, str], packs: Sequence[str]
 ) -> Task | RunFolder:
-    """The task or the run of an agent that a command was given. Raises CompileError and BadInput."""
+    """The task, or the run of an agent, that a command was given. Raises CompileError and BadInput."""
     from powderdsl.tasks.shipped import is_task, load_task
 
     if is_task(name):

@@ -42,18 +42,18 @@ def print_json(value: Any) -> None:
 
 
 def counted(number: int, thing: str, things: str = "") -> str:
-    """`no errors`, `1 error`, `2 errors`; `things` is the plural of words without a simple one."""
+    """`no errors`, `1 error`, `2 errors`; `things` is an irregular plural."""
     return f"{number or 'no'} {thing if number == 1 else things or f'{thing}s'}"
 
 
 # Progress
 
 SECONDS = 30
-"""Time between two lines where there is no terminal."""
+"""Time between two lines if stderr is not a terminal."""
 
 
 Show = Callable[..., None]
-"""``show(done, words="")`` shows how much is done, with words beside it."""
+"""``show(done, words="")`` shows the progress and a text."""
 
 
 @contextmanager
@@ -62,15 +62,15 @@ def progress(title: str, total: float, *, lines: bool = False, resumes: Path | N
 
     Args:
         total: the final value of `done`.
-        lines: where stderr is not a terminal, write a line every `SECONDS`; otherwise nothing.
-        resumes: the folder in which the same command continues after an interruption; a line then says so.
+        lines: if stderr is not a terminal, write a line every `SECONDS` instead of nothing.
+        resumes: the folder in which the same command resumes after an interruption, for the message.
     """
     try:
         with _bar(title, total, lines) as show:
             yield show
     except KeyboardInterrupt:
         if resumes is not None:
-            click.echo(f"interrupted; the same command continues in {quote(str(resumes))}", err=True)
+            click.echo(f"interrupted; run the same command again to resume {quote(str(resumes))}", err=True)
         raise
 
 
@@ -94,8 +94,8 @@ def _bar(title: str, total: float, lines: bool) -> Iterator[Show]:
     columns = (TextColumn("{task.description}", markup=False), BarColumn(), MofNCompleteColumn(), clock)
     console = Console(file=raw_stream(sys.stderr), highlight=False, soft_wrap=True)
     shown = TextColumn("{task.fields[words]}", markup=False)
-    # Inside, stderr is rich's, which prints above the bar: what goes there is escaped as well.
-    # The pace of minutes counts pauses too, such as updates of a network.
+    # Inside, stderr is rich's, which prints above the bar, and is escaped as well.
+    # A pace over minutes includes pauses, such as updates of a network.
     with (
         Progress(*columns, shown, console=console, transient=True, speed_estimate_period=600) as bar,
         printable_streams(),

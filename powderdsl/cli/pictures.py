@@ -1,4 +1,4 @@
-"""Worlds as pictures: in files, and in a terminal, two cells a character in 24-bit color or as plain glyphs."""
+"""Worlds as pictures: in files, or in a terminal (two cells per character in 24-bit color, or plain glyphs)."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from powderdsl.simulation.simulator import World
 
 MAX_SIDE = 16_384
-"""Pixels a side. More would take gigabytes before the first one is written."""
+"""Maximum pixels per side: larger pictures take gigabytes before the first byte is written."""
 
 
 def pictures(world: World, *, most: int, factor: int | None) -> NDArray[np.uint8]:
@@ -45,7 +45,7 @@ def first_world(world: World) -> dict[str, Any]:
 # In a terminal
 
 UPPER_HALF = "▀"
-"""Its color is the upper cell, its background the lower one. (Frames through `rich.live` take 20 times as long.)"""
+"""The foreground is the upper cell, the background the lower one. (`rich.live` takes 20 times as long.)"""
 
 _RESET = "\x1b[0m"
 _NO_BACKGROUND = "\x1b[49m"
@@ -56,7 +56,7 @@ _CLEAR_LINE, _CLEAR_BELOW = "\x1b[2K", "\x1b[J"
 def render_frame(image: Any) -> str:
     """A picture uint8 [H, W, 3] as ⌈H/2⌉ lines of half blocks; each line resets its colors.
 
-    A color is written only where it changes, which keeps frames small enough for slow connections.
+    Colors are written only where they change, which keeps frames small enough for slow connections.
     """
     picture = to_numpy(image).tolist()
     lines = []
@@ -77,13 +77,13 @@ def render_frame(image: Any) -> str:
 
 
 class LiveView:
-    """Shows one world after the other in one place; a context manager that leaves the terminal as it was.
+    """Show worlds one after another in place; a context manager that restores the terminal.
 
         with LiveView(rules.elements, fields=rules.fields) as view:
             view.show(ids, caption="step 12")
 
-    Where the output is not a terminal, frames follow one another as plain text. With NO_COLOR set
-    (https://no-color.org) glyphs are redrawn in place. Worlds that do not fit are thinned out. On a terminal, frames follow one another no faster than `fps`.
+    If the output is not a terminal, frames are printed as plain text. With NO_COLOR set (https://no-color.org), glyphs
+    are redrawn in place. Worlds that do not fit are thinned out. On a terminal, `fps` limits the frame rate.
     """
 
     def __init__(
@@ -110,14 +110,14 @@ class LiveView:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None:
-        # On Ctrl-C too: the frame stays on the screen, and the prompt comes below it in its usual colors.
+        # On Ctrl-C too, the frame stays on the screen, and the prompt appears below it in its usual colors.
         if self.in_place:
             self._write(_RESET + _SHOW_CURSOR)
 
     def show(self, ids: Any, caption: str = "", fields: Mapping[str, Any] | None = None) -> None:
-        """Draw ids [H, W], array or tensor; `caption` stands below.
+        """Draw ids [H, W], an array or tensor, with `caption` below.
 
-        `fields` has the fields that pictures show, [H, W] or of vectors [2, H, W], by name.
+        `fields` maps the names of fields that pictures show to [H, W], or [2, H, W] for vectors.
         """
         ids = to_numpy(ids)
         shown = {name: to_numpy(value) for name, value in (fields or {}).items()}

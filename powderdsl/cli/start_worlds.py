@@ -21,8 +21,8 @@ if TYPE_CHECKING:
 DEFAULT_SIDE = 64
 
 FEW = 1 << 27
-"""Cells times steps that WebAssembly runs in about a second, the time that it takes to import torch. Also, 100 times the
-number of cells: larger worlds may not fit into the memory of WebAssembly."""
+"""Cells times steps that WebAssembly runs in about a second, the time that importing torch takes. Also 100 times the
+number of cells that surely fit into the memory of WebAssembly."""
 
 
 def start(
@@ -36,18 +36,18 @@ def start(
     steps: int = 0,
     **how: Any,
 ) -> World:
-    """The worlds that a run starts from; each has random numbers of its own.
+    """The worlds that a run starts from, each with its own random numbers.
 
-    Only if many steps follow, `auto` imports torch and may compile native code; `how` is passed on to `simulator.compile`.
-    Raises CompileError for a file or name that cannot be used, BadInput for options that do not go together.
+    `auto` imports torch, and may compile native code, only if many steps follow; `how` is passed to
+    `simulator.compile`. Raises CompileError for an invalid file or name, BadInput for incompatible options.
     """
-    # A drawn world comes first: compiling may import torch, and whoever mistyped a name should not wait for that.
+    # Draw the world first, so that a mistyped name fails before torch is imported.
     drawn = start_drawn(ruleset, name, size, batch, seed)
     from powderdsl.simulation.simulator import LAST_STEP, compile
 
-    memo = Memo()  # what is lowered here is not lowered again
+    memo = Memo()  # so that it is lowered only once
     many = drawn is None or drawn.ids.size * max(steps, 100) > FEW
-    # WebAssembly runs only what bit planes carry; without torch, the slow oracle runs the rest.
+    # WebAssembly runs only passes on bit planes; without torch, the slow oracle runs the rest.
     tensors = backend == "auto" and (many or any(part.planes is None for part in segments_of(ruleset, memo)))
     sim = compile(ruleset, backend, tensors=tensors, memo=memo, **how)
     from powderdsl.worlds.store import fresh_world, load_world
@@ -67,8 +67,8 @@ def start_drawn(
 ) -> Start | None:
     """Fresh worlds, ids uint8 [B, H, W]; None for a saved world, which is complete.
 
-    A saved world continues as it was saved, random future included, so `size`, `batch` and `seed` do not go
-    with it. A drawn world is repeated `batch` times. Without a name, each world is scattered independently.
+    A saved world continues with its own random numbers, so `size`, `batch` and `seed` are not allowed with it. A drawn
+    world is repeated `batch` times. Without a name, each world is scattered independently.
     """
     if name is None:
         side = fitting(ruleset, DEFAULT_SIDE)

@@ -1,4 +1,4 @@
-"""Offline data: episodes recorded from tasks, and read back as minibatches."""
+"""Offline data: recording episodes of tasks, and reading them as minibatches."""
 
 from __future__ import annotations
 

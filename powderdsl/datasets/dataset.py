@@ -1,9 +1,9 @@
 """Recorded episodes in shards, read one at a time, as transitions by number, or as endless random minibatches.
 
-A shard has whole episodes as flat arrays in one .npz, written whole or not at all. An episode of T actions has T rows of
-`action`, `reward`, `terminated`, `truncated`, `success`, and T + 1 of `observation`; episodes follow one another. So row t
-of an episode's observations is what its action t was taken at, and row t + 1 what came of it, also at its end. Arrays that
-are not compressed are mapped, not read.
+A shard contains whole episodes as flat arrays in one .npz file, which is written atomically. An episode of T actions
+has T rows of `action`, `reward`, `terminated`, `truncated`, `success`, and T + 1 of `observation`; episodes follow one
+another. So row t of an episode's observations precedes its action t, and row t + 1 follows it, even at the end.
+Uncompressed arrays are memory-mapped.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ Array = NDArray[Any]
 MEANING = ("observation", "channels", "shape", "palette", "action_nvec", "choices")
 """Fields of a recipe that define what the numbers of observations and actions mean."""
 UNITS = ("world", "episode")
-"""What `split` keeps together."""
+"""The unit that `split` keeps together."""
 
 DTYPES = {
     "observation": "|u1",
@@ -65,7 +65,7 @@ DTYPES = {
     "world": "<i8",
 }
 LEVEL = 1
-"""Compression level of deflate. Higher levels take three to five times as long for a quarter less."""
+"""Compression level of deflate. Higher levels take three to five times as long to save a quarter."""
 
 
 def row_shape(recipe: Recipe, name: str) -> tuple[int, ...]:
@@ -83,7 +83,7 @@ def write_shard(
 ) -> ShardRow:
     """Write a shard from arrays in parts, which are concatenated. Equal arrays make equal files.
 
-    Raises CompileError (PD613) if the place cannot be written, or the disk is full.
+    Raises CompileError (PD613) if the file cannot be written.
     """
     path = folder / shard_file(number)
     arrays: dict[str, Array | Parts | str] = {}
@@ -103,15 +103,15 @@ def write_shard(
 
 @dataclass(frozen=True)
 class Shard:
-    """The arrays of a shard, as `DTYPES` and `shapes` have them; read-only."""
+    """The read-only arrays of a shard, with the types of `DTYPES` and `shapes`."""
 
     arrays: dict[str, Array]
     loaded: int
-    """Bytes of these arrays that are in memory rather than mapped."""
+    """Bytes of these arrays in memory, not mapped."""
 
     @cached_property
     def starts(self) -> Array:
-        """The first transition of each episode: int64 [episodes]. Its first observation is `starts` + its place."""
+        """The first transition of each episode: int64 [episodes]. Its first observation is `starts` + its index."""
         length = self.arrays["length"].astype(np.int64)
         return np.cumsum(length) - length
 
@@ -128,31 +128,31 @@ def is_whole(folder: Path, row: ShardRow) -> bool:
 
 
 def open_shard(folder: Path, recipe: Recipe, row: ShardRow) -> Shard:
-    """A shard, after checking every byte of it.
+    """Read a shard after checking every byte of it.
 
-    Raises CompileError (PD630), naming the shard and what is wrong with it.
+    Raises CompileError (PD630) with the shard and the fault.
     """
     path = folder / row.file
     with _damage(path):
         if not is_whole(folder, row):
-            raise BadArchive("its size or its SHA-256 is another than the manifest's")
+            raise BadArchive("its size or its SHA-256 differs from the manifest's")
         shard = _read(path, shapes(recipe, row.number, row.transitions))
         check_episodes(shard.arrays, recipe)
     return shard
 
 
 def _damage(path: Path) -> AbstractContextManager[None]:
-    return reporting_damage(f"the shard {path} is damaged", "the command that recorded it records it again")
+    return reporting_damage(f"the shard {path} is damaged", "run the command that recorded it again")
 
 
 def _read(path: Path, expected: dict[str, tuple[int, ...]], only: tuple[str, ...] = tuple(DTYPES)) -> Shard:
-    """Some arrays of an archive. Raises if it does not have exactly the expected ones."""
+    """Some arrays of an archive. Raises an error unless it has exactly the expected ones."""
     arrays: dict[str, Array] = {}
     loaded = 0
     whole = np.memmap(path, np.uint8, "r")
     with open_archive(path) as archive:
         if archive.headers.keys() != expected.keys():
-            raise BadArchive(f"it must hold {', '.join(expected)}, and nothing else")
+            raise BadArchive(f"it must contain exactly {', '.join(expected)}")
         for name in only:
             header, shape, dtype = archive.headers[name], expected[name], np.dtype(DTYPES[name])
             if (header.shape, header.dtype) != (shape, dtype.name):
@@ -176,7 +176,7 @@ def _check_lengths(length: Array, recipe: Recipe, transitions: int) -> None:
 
 
 def knows_ids(recipe: Recipe, observation: Array) -> bool:
-    """True if the palette has all ids of observations, uint8 [n, C, H, W]."""
+    """True if the palette contains all ids of observations, uint8 [n, C, H, W]."""
     known = np.zeros(256, bool)
     known[[int(number) for number in recipe.palette]] = True
     where = recipe.channels.index("element") if "element" in recipe.channels else 0
@@ -185,14 +185,14 @@ def knows_ids(recipe: Recipe, observation: Array) -> bool:
 
 
 def check_episodes(arrays: Mapping[str, Array], recipe: Recipe) -> None:
-    """Check that episodes end where their lengths say, and that actions are in range. Raises BadArchive."""
+    """Check that episodes have the recorded lengths, and that actions are in range. Raises BadArchive."""
     length, action = arrays["length"].astype(np.int64), arrays["action"]
     _check_lengths(length, recipe, len(action))
     ended = arrays["terminated"].astype(np.int64) + arrays["truncated"]
     last = np.zeros_like(ended)
     last[np.cumsum(length) - 1] = 1
     if not np.array_equal(ended, last):
-        raise BadArchive("episodes do not end where their lengths say")
+        raise BadArchive("episodes do not have the recorded lengths")
     if (action < 0).any() or (action >= np.array(recipe.action_nvec)).any():
         raise BadArchive("it has actions out of range")
     if (arrays["world"] < 0).any():
@@ -203,7 +203,7 @@ class Batch(NamedTuple):
     """Transitions, or sequences of them: tensors [B, …], or [B, L, …].
 
     `observation` and `next_observation` are uint8, `action` int16, `reward` float32, the others bool. The next
-    observation of an episode's last transition is the one that the episode ended with.
+    observation of an episode's last transition is its final observation.
     """
 
     observation: Tensor
@@ -231,8 +231,7 @@ class Episode(NamedTuple):
 class Dataset:
     """The episodes recorded in a folder, opened by `Dataset.open`.
 
-    The size, SHA-256 and arrays of a shard are checked when it is first needed. Shards that are not compressed are mapped
-    into memory.
+    The size, SHA-256 and arrays of a shard are checked on first use. Uncompressed shards are memory-mapped.
     """
 
     def __init__(self, folder: Path, manifest: Manifest, memory: int):
@@ -245,8 +244,8 @@ class Dataset:
         """Open the dataset of a folder.
 
         Args:
-            folder: the folder that `record` wrote.
-            memory: bytes that unpacked shards of a compressed dataset may take. One shard always stays in memory.
+            folder: the folder written by `record`.
+            memory: maximum bytes of unpacked shards of a compressed dataset. One shard is always kept.
 
         Raises:
             CompileError: PD630 if there is no dataset, or it is damaged or incomplete.
@@ -256,11 +255,13 @@ class Dataset:
         missing = manifest.recipe.shards - len(manifest.shards)
         if missing:
             reason = f"{missing} of {manifest.recipe.shards} shards are missing"
-            raise damaged(f"{place} is not complete", reason, "the command that began it completes it")
+            raise damaged(
+                f"{place} is not complete", reason, "run the command that began it again to complete it"
+            )
         return cls(place, manifest, memory)
 
     def __reduce__(self) -> tuple[Any, ...]:
-        # For workers, without what is mapped.
+        # For workers, without mapped arrays.
         return partial(Dataset.open, memory=self.memory), (str(self.folder),)
 
     def __len__(self) -> int:
@@ -273,10 +274,10 @@ class Dataset:
         return self.manifest.transitions
 
     def require(self, env: TensorEnv, *, same_rules: bool = False) -> None:
-        """Refuse an environment in which these observations and actions mean something else.
+        """Reject an environment in which these observations and actions have another meaning.
 
         Args:
-            same_rules: also refuse other rules, parameters, or another task.
+            same_rules: also reject other rules, parameters, or another task.
 
         Raises:
             CompileError: PD631, naming each difference.
@@ -285,14 +286,14 @@ class Dataset:
         self.require_equal(recipe_of(env), names, env.task.name)
 
     def require_equal(self, other: Recipe, names: tuple[str, ...], whose: object) -> None:
-        """Raise CompileError (PD631) where some values of the recipe differ from those of another."""
+        """Raise CompileError (PD631) if some values of the recipe differ from those of another."""
         own, others = ({name: getattr(recipe, name) for name in names} for recipe in (self.recipe, other))
         notes = differences(own, others)
         if notes:
             raise failure("PD631", f"{self.folder} does not fit {whose}", notes=notes)
 
     def check(self) -> None:
-        """Read every byte of every shard. Raises CompileError (PD630), with each shard that is damaged."""
+        """Read every byte of every shard. Raises CompileError (PD630) with all damaged shards."""
         errors: list[Diagnostic] = []
         for number, row in enumerate(self.manifest.shards):
             self._shards.pop(number, None)
@@ -320,7 +321,7 @@ class Dataset:
         return Episode(number, int(shard.arrays["world"][place]), **values)
 
     def transitions(self, batch: int, **how: Any) -> Batches:
-        """Yield minibatches of `batch` transitions without end, all equally likely, drawn with replacement.
+        """Yield endless minibatches of `batch` transitions, drawn uniformly with replacement.
 
         Args:
             how: `seed`, `start` (the number of the first minibatch) and `device`, as in `Batches`.
@@ -328,7 +329,7 @@ class Dataset:
         return Batches(Transitions(self), batch, **how)
 
     def sequences(self, length: int, batch: int, **how: Any) -> Batches:
-        """Yield minibatches [B, L, …] of `length` successive transitions of an episode without end, all equally likely.
+        """Yield endless minibatches [B, L, …] of `length` successive transitions of an episode, drawn uniformly.
 
         Args:
             how: as in `transitions`.
@@ -352,7 +353,7 @@ class Dataset:
             rows = np.flatnonzero(number == shard_number)
             shard = self._shard(shard_number)
             at = (shard.starts[place[rows]] + first[rows])[:, None] + np.arange(length)
-            shown = at + place[rows][:, None]  # each episode before has one observation more than actions
+            shown = at + place[rows][:, None]  # each earlier episode has one observation more than actions
             for name, of in stored.items():
                 index = shown + (name != of) if of == "observation" else at
                 out[name][rows] = shard.arrays[of][index]
@@ -361,7 +362,7 @@ class Dataset:
     def lengths_and_worlds(self) -> tuple[Array, Array]:
         """The number of actions and the world of every episode: int64 [episodes] each.
 
-        Other bytes of shards are neither read nor checked. Raises as `open_shard`.
+        Other parts of shards are neither read nor checked. Raises as `open_shard`.
         """
         lengths, worlds = [], []
         for row in self.manifest.shards:
@@ -374,7 +375,7 @@ class Dataset:
         return np.concatenate(lengths), np.concatenate(worlds).astype(np.int64)
 
     def _shard(self, number: int) -> Shard:
-        """A shard, which stays open while there is room."""
+        """A shard, which is kept open while memory allows."""
         if number not in self._shards:
             row = self.manifest.shards[number]
             self._shards[number] = open_shard(self.folder, self.recipe, row)
@@ -387,7 +388,7 @@ class Dataset:
 
 
 class _Episodes(NamedTuple):
-    """Some episodes of several datasets, int64 [n] each: the dataset's place, their numbers in it, worlds, actions."""
+    """Some episodes of several datasets, int64 [n] each: the dataset's index, their numbers in it, worlds, actions."""
 
     source: Array
     number: Array
@@ -396,19 +397,19 @@ class _Episodes(NamedTuple):
 
 
 class Transitions(torch.utils.data.Dataset[Batch]):
-    """All transitions of one or several datasets, by number: dataset by dataset, episode by episode, in order.
+    """All transitions of one or several datasets, numbered in the order of datasets and episodes.
 
     ``rows[i]`` is transition i, a `Batch` without the dimension B; ``rows[[3, 5]]`` and ``rows[2:9]`` are a `Batch`;
     ``len(rows)`` counts them. Rows are read when they are indexed, and workers of a `DataLoader` open the folders
     themselves.
 
     Args:
-        data: a dataset, or several whose observations and actions mean the same.
-        length: read sequences of that many successive transitions of an episode, [L, …], instead of single ones.
+        data: a dataset, or several with the same meaning of observations and actions.
+        length: read sequences of this many successive transitions of an episode, [L, …], instead of single ones.
 
     Raises:
         CompileError: PD630 if a shard is damaged; PD631 if the datasets do not fit together.
-        ValueError: there is no dataset, or no episode of that length.
+        ValueError: there is no dataset, or no episode is long enough.
     """
 
     def __init__(self, data: Dataset | Sequence[Dataset], *, length: int | None = None):
@@ -435,7 +436,7 @@ class Transitions(torch.utils.data.Dataset[Batch]):
 
     @property
     def worlds(self) -> Tensor:
-        """The worlds that occur, ascending: int64 [n]."""
+        """The distinct worlds, ascending: int64 [n]."""
         return torch.from_numpy(np.unique(self.episodes.world))
 
     def __len__(self) -> int:
@@ -443,7 +444,7 @@ class Transitions(torch.utils.data.Dataset[Batch]):
         return int(self._ends[-1]) if len(self._ends) else 0
 
     def __getitem__(self, numbers: Any) -> Batch:
-        """One transition, or a `Batch` of those of a slice, a list or an array. Raises IndexError, TypeError."""
+        """One transition, or a `Batch` for a slice, a list or an array. Raises IndexError, TypeError."""
         if isinstance(numbers, slice):
             return self._batch(np.arange(len(self))[numbers])
         if isinstance(numbers, Sequence | np.ndarray | Tensor) and np.ndim(numbers):
@@ -451,7 +452,7 @@ class Transitions(torch.utils.data.Dataset[Batch]):
         return Batch(*(value[0] for value in self._batch(np.array([integer(numbers)], np.int64))))
 
     def __getitems__(self, numbers: Sequence[int]) -> list[Batch]:
-        """Several transitions, read together. `DataLoader` calls it for each minibatch."""
+        """Read several transitions together. `DataLoader` calls it for each minibatch."""
         batch = self._batch(_integers(numbers))
         return [Batch(*row) for row in zip(*(value.unbind() for value in batch), strict=True)]
 
@@ -480,14 +481,14 @@ class Batches(IterableDataset[Batch]):
     """An endless iterator over minibatches: see `Dataset.transitions` and `Dataset.sequences`.
 
     It is also a dataset for `torch.utils.data.DataLoader` with ``batch_size=None``. Worker w of W reads every W-th
-    minibatch from the w-th, so the loader yields the same minibatches in the same order with any number of workers.
+    minibatch from the w-th, so the order of minibatches does not depend on the number of workers.
 
     Args:
         rows: the transitions to draw from.
         batch: transitions in a minibatch.
-        seed: minibatch n depends on the seed and on n alone.
+        seed: minibatch n depends only on the seed and n.
         device: the torch device of the minibatches.
-        start: number of the first minibatch, to continue where an iterator stopped.
+        start: number of the first minibatch, to resume an iterator.
     """
 
     def __init__(
@@ -504,7 +505,7 @@ class Batches(IterableDataset[Batch]):
         check_count("start", start, (1 << 62) - 1, least=0)
         self.rows, self.batch, self.seed, self.device = rows, batch, seed, device
         self.number = start
-        """Of the next minibatch; in a worker, of the first one that its workers read next."""
+        """The number of the next minibatch; in a worker, of the first one that the workers read next."""
 
     def __iter__(self) -> Batches:
         return self
@@ -526,7 +527,7 @@ def drawn(seed: int, number: int, count: int, below: int) -> Array:
 
 
 def _integers(numbers: Any) -> Array:
-    """A sequence of integers as an array, int64 [n]. Raises TypeError for other values, masks among them."""
+    """A sequence of integers as an array, int64 [n]. Raises TypeError for other values, including masks."""
     array = np.asarray(numbers)
     if array.ndim != 1 or (len(array) and array.dtype.kind not in "iu"):
         raise TypeError(f"transitions are numbered by integers, found {array.dtype} {list(array.shape)}")
@@ -536,11 +537,11 @@ def _integers(numbers: Any) -> Array:
 def split(
     rows: Transitions, fractions: Sequence[float], *, by: str = "world", seed: int = 0
 ) -> tuple[Transitions, ...]:
-    """Split transitions into parts, such that no world, or no episode, has transitions in two parts.
+    """Split transitions into parts, so that no world (or episode) has transitions in two parts.
 
-    A hash of `seed` and of the world (and of the episode's number, by episode) decides the part. So it is the same in
-    every process, in other recordings of the world, and after episodes are added; and the sizes of parts are close to the
-    fractions, not equal to them.
+    The part is chosen by a hash of `seed` and the world (and, by episode, the episode's number). So it is the same in
+    every process, in other recordings of the world, and after episodes are added. The sizes of parts are only
+    approximately the fractions.
 
     Args:
         rows: the transitions.
@@ -576,7 +577,7 @@ def split(
     return tuple(parts)
 
 
-# The flat layouts of D4RL and OGBench, which offline learners take: they hold everything in memory
+# The flat layouts of D4RL and OGBench for offline learners, which load everything into memory
 
 LAYOUTS = ("d4rl", "ogbench")
 
@@ -586,12 +587,12 @@ def flat(dataset: Dataset, layout: str = "d4rl") -> dict[str, NDArray[Any]]:
 
     Args:
         layout: ``d4rl``: N rows of `observations`, `actions`, `rewards`, `next_observations`, `terminals` and
-            `timeouts`. ``ogbench``: what its dataset files hold and its `load_dataset` reads: each episode has one row
-            more, its last observation with an action of zeros; `terminals` is 1 there and nowhere else. `masks`, which
-            it does not read, is 0 where an episode terminated, and `rewards` 0 in the last row.
+            `timeouts`. ``ogbench``: the layout of its dataset files, as read by its `load_dataset`: each episode has
+            one more row, its last observation with an action of zeros, and `terminals` is 1 only there. `masks`, which
+            it does not read, is 0 where an episode terminated, and `rewards` is 0 in the last row.
 
     Raises:
-        ValueError: another layout.
+        ValueError: an unknown layout.
     """
     check_choice("layout", layout, LAYOUTS)
     parts = [_episode(dataset, number, layout) for number in range(len(dataset))]

@@ -1,4 +1,4 @@
-"""A dataset's manifest: how it was recorded, what its numbers mean, and which shards it has. No torch."""
+"""A dataset's manifest: how it was recorded, the meaning of its numbers, and its shards. Does not need torch."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ FORMAT = "powderdsl-dataset"
 VERSION = 1
 FILE = "dataset.json"
 KINDS = ("ids", "compact", "laws")
-"""Observations that are recorded. The others follow from these."""
+"""Forms of observation that can be recorded. The others follow from these."""
 USUAL_SHARD = 256
 USUAL_SHARD_BYTES = 1 << 28
 MAX_BYTES = 1 << 24
@@ -44,9 +44,9 @@ Palette = Annotated[Mapping[str, str], Limits(keys=r"[0-9]|[1-9][0-9]|1[0-9]{2}|
 
 @dataclass(frozen=True)
 class Recipe:
-    """Everything that decides the arrays of a dataset, and what is needed to read them.
+    """Everything that determines the arrays of a dataset, or is needed to read them.
 
-    Two datasets of equal recipes have equal shards, byte for byte. `palette` names ids, `choices` the values of an
+    Datasets with equal recipes have equal shards, byte for byte. `palette` names ids; `choices` names the values of an
     action's third number: elements by qualified name, ``blow``, ``nothing``.
     """
 
@@ -63,19 +63,19 @@ class Recipe:
     worlds: Annotated[int, Limits(1, (1 << 62) - 1)]
     episodes: Episodes
     shard: Episodes
-    """Episodes of a shard; the last one may have fewer."""
+    """Number of episodes per shard; the last one may have fewer."""
     compress: bool
     observation: Annotated[str, Limits(choices=KINDS)]
     channels: Names
     shape: Annotated[tuple[Annotated[int, Limits(1, MAX_SIDE)], ...], Limits(length=(3, 3))]
-    """Of an observation: channels, rows, columns. Its numbers are bytes."""
+    """Shape of an observation of bytes: channels, rows, columns."""
     palette: Palette
     action_nvec: Annotated[tuple[Annotated[int, Limits(1, (1 << 15) - 1)], ...], Limits(length=(5, 5))]
     choices: Names
     actions: Annotated[int, Limits(1, 1_000_000)]
-    """The most actions of an episode."""
+    """Maximum number of actions of an episode."""
     last_action: Annotated[str, Limits(choices=("truncates", "terminates"))]
-    """How an episode ends when it runs out of actions."""
+    """How an episode ends after its last action."""
 
     @property
     def shards(self) -> int:
@@ -89,7 +89,7 @@ class Recipe:
 
 @dataclass(frozen=True)
 class ShardRow:
-    """A shard's row in the manifest. The number decides the file's name, so no name can lead out of the folder."""
+    """A shard's row in the manifest. The file name follows from the number, so it cannot lead out of the folder."""
 
     number: Annotated[int, Limits(0, MAX_SHARDS - 1)]
     sha256: Digest
@@ -105,7 +105,7 @@ class ShardRow:
 class Manifest:
     recipe: Recipe
     created: str
-    """When recording began, ISO 8601."""
+    """The time when recording began, in ISO 8601."""
     shards: Annotated[tuple[ShardRow, ...], Limits(length=(0, MAX_SHARDS))]
     """The recorded shards, ascending."""
 
@@ -122,13 +122,13 @@ def shard_file(number: int) -> str:
 
 
 def write_manifest(folder: Path, manifest: Manifest) -> None:
-    """Write a manifest whole or not at all. Raises CompileError (PD613)."""
+    """Write a manifest atomically. Raises CompileError (PD613)."""
     data = {"format": FORMAT, "version": VERSION, **asdict(manifest)}
     write_text(folder / FILE, json.dumps(data, indent=1, ensure_ascii=False) + "\n")
 
 
 def read_manifest(folder: Path) -> Manifest:
-    """The manifest of a folder, every value checked. Raises CompileError (PD630), with all that is wrong."""
+    """Read and check the manifest of a folder. Raises CompileError (PD630) with all mistakes."""
     path = folder / FILE
     try:
         data = parse_json(read_bytes(path, MAX_BYTES))
@@ -165,9 +165,9 @@ def _checked(path: Path, data: Any) -> Manifest:
 
 
 def check_place(folder: Path) -> None:
-    """Check, before long work, that a dataset can be recorded in a folder.
+    """Check in advance that a dataset can be recorded in a folder.
 
-    Raises CompileError: PD613 if the folder around it is not there, PD630 if it holds something else.
+    Raises CompileError: PD613 if its parent folder does not exist, PD630 if it contains something else.
     """
     if not folder.is_dir():
         reason = "it is a file" if folder.exists() else f"there is no folder {folder.parent}"
@@ -176,8 +176,8 @@ def check_place(folder: Path) -> None:
         return
     names = sorted(path.name for path in folder.iterdir() if not path.name.startswith("."))
     if names and FILE not in names:
-        reason = f"it holds {names[0]} and no {FILE}"
-        raise damaged(f"{folder} is not a dataset", reason, "take an empty folder")
+        reason = f"it contains {names[0]} but no {FILE}"
+        raise damaged(f"{folder} is not a dataset", reason, "choose an empty folder")
 
 
 def damaged(message: str, reason: str, *helps: str) -> CompileError:
@@ -187,7 +187,7 @@ def damaged(message: str, reason: str, *helps: str) -> CompileError:
 
 @contextmanager
 def reporting_damage(message: str, *helps: str) -> Iterator[None]:
-    """Turn whatever reading damaged files raises, as codecs like, into CompileError (PD630)."""
+    """Turn any exception from reading damaged files into CompileError (PD630)."""
     try:
         yield
     except Exception as error:
@@ -246,7 +246,7 @@ def recipe_of(
         channels=tuple(env.observation.channels),
         shape=tuple(int(side) for side in env.observation.space.shape),
         palette={str(element.id): element.qualified for element in ruleset.elements},
-        action_nvec=env.program.action_nvec,  # data have all five numbers, whatever form the environment takes
+        action_nvec=env.program.action_nvec,  # data have all five numbers, whatever the environment's form of actions
         choices=choice_names(task),
         actions=env.max_episode_steps,
         last_action="terminates" if env.last_action_terminates else "truncates",
@@ -260,7 +260,7 @@ def recipe_of(
     if shard * each > MAX_SHARD_BYTES:
         problems.append(
             f"a shard of {shard} episodes may take {shard * each:,} bytes, more than {MAX_SHARD_BYTES:,}: "
-            "record fewer episodes a shard, or shorter ones with max_episode_steps"
+            "record fewer episodes per shard, or shorter ones with max_episode_steps"
         )
     if problems:
         raise ValueError("; ".join(problems))
@@ -268,7 +268,7 @@ def recipe_of(
 
 
 def episode_bytes(recipe: Recipe) -> int:
-    """The most bytes that the arrays of an episode take."""
+    """Maximum number of bytes of an episode's arrays."""
     return (recipe.actions + 1) * (prod(recipe.shape) + 32)
 
 
@@ -284,7 +284,7 @@ def _contradictions(recipe: Recipe, shards: Sequence[ShardRow]) -> list[str]:
         count = len(recipe.episodes_of(row.number))
         unpacked = (row.transitions + count) * prod(recipe.shape)
         if row.number in numbers or row.number >= recipe.shards:
-            problems.append(f"`shards[{place}]`: there is no shard {row.number}, or it comes twice")
+            problems.append(f"`shards[{place}]`: shard {row.number} does not exist or is repeated")
         elif not count <= row.transitions <= count * recipe.actions:
             problems.append(f"`shards[{place}]`: {count} episodes cannot have {row.transitions} transitions")
         elif unpacked > MAX_SHARD_BYTES:

@@ -1,4 +1,4 @@
-"""Datasets as Minari datasets, and back. Both directions keep every value.
+"""Conversion of datasets to Minari datasets and back, without loss.
 
 Minari stores uint8 images as JPEG by default, which changes ids. The export turns that off.
 """
@@ -32,7 +32,7 @@ Array = NDArray[Any]
 KEY = "powderdsl"
 """The recipe's key in the metadata of a Minari dataset."""
 DATA = "data"
-"""Minari's folder in that of a dataset."""
+"""Minari's subfolder of a dataset's folder."""
 
 
 def require_minari() -> None:
@@ -47,20 +47,20 @@ def require_minari() -> None:
 def to_minari(
     dataset: Dataset, dataset_id: str, *, author: str | None = None, description: str | None = None
 ) -> minari.MinariDataset:
-    """Write a dataset to Minari's folder, episode by episode, completely or not at all.
+    """Write a dataset to Minari's folder, episode by episode, and atomically.
 
     Actions are the five numbers, int64 [T, 5]; observations and rewards keep their dtypes. An episode's seed is its
     world; infos have `success` and `world`, [T + 1] each. If the task is a shipped one with the recorded rules,
-    `recover_environment` makes it.
+    `recover_environment` recreates it.
 
     Args:
         dataset: the dataset to write.
         dataset_id: ``namespace/name-v0``.
-        author: of the dataset, for Minari's metadata.
-        description: of the dataset, for Minari's metadata.
+        author: author of the dataset, for Minari's metadata.
+        description: description of the dataset, for Minari's metadata.
 
     Raises:
-        CompileError: PD612 if Minari is not installed; PD613 if there is such a dataset or the folder cannot be written;
+        CompileError: PD612 if Minari is not installed; PD613 if the dataset exists or the folder cannot be written;
             PD630 if a shard is damaged.
         ValueError: Minari rejects the id.
     """
@@ -76,9 +76,9 @@ def to_minari(
     if place.exists():
         raise failure(
             "PD613",
-            f"there is a Minari dataset {dataset_id}",
+            f"the Minari dataset {dataset_id} already exists",
             notes=(str(place),),
-            helps=(f"take another version, or `minari delete {dataset_id}`",),
+            helps=(f"choose another version, or run `minari delete {dataset_id}`",),
         )
     recipe = dataset.recipe
     about = f"{recipe.episodes} episodes of the task {recipe.task} ({recipe.split}), policy: {recipe.policy}."
@@ -132,7 +132,7 @@ def _buffers(dataset: Dataset) -> Iterator[Any]:
 
 
 def _spec(recipe: Recipe) -> Any:
-    """The spec of the environment that was recorded; None unless its task is a shipped one with the same rules."""
+    """The spec of the recorded environment; None unless its task is a shipped one with the same rules."""
     import gymnasium
 
     if recipe.task not in shipped_tasks():
@@ -167,11 +167,11 @@ def from_minari(dataset_id: str, folder: str | Path) -> Dataset:
 
     Args:
         dataset_id: ``namespace/name-v0``.
-        folder: the folder to write, which is made, but not its parent. An interrupted import is completed.
+        folder: the folder to write, which is created, but not its parent. An interrupted import is completed.
 
     Raises:
-        CompileError: PD612 if Minari is not installed; PD630 if there is no such dataset, it is damaged, or `to_minari`
-            did not write it; PD631 if the folder has another dataset; PD613 if the folder cannot be written.
+        CompileError: PD612 if Minari is not installed; PD630 if the dataset does not exist, is damaged, or was not
+            written by `to_minari`; PD631 if the folder has another dataset; PD613 if the folder cannot be written.
         ValueError: Minari rejects the id.
     """
     require_minari()
@@ -198,7 +198,7 @@ def _opened(folder: Path) -> minari.MinariDataset:
     from minari.dataset.minari_storage import MinariStorage
 
     with reporting_damage(f"{folder} cannot be imported"):
-        # Minari makes an environment to get spaces that are missing, with whatever function the file names.
+        # To get missing spaces, Minari would create an environment with any function that the file names.
         missing = {"observation_space", "action_space"} - MinariStorage.read_raw_metadata(folder).keys()
         if missing:
             raise ValueError(f"its metadata lack {min(missing)}")
@@ -206,18 +206,18 @@ def _opened(folder: Path) -> minari.MinariDataset:
 
 
 def _exported_recipe(source: minari.MinariDataset) -> Recipe:
-    """The recipe that `to_minari` left. Raises CompileError (PD630)."""
+    """The recipe stored by `to_minari`. Raises CompileError (PD630)."""
     folder, exported = source.storage.data_path, source.storage.metadata.get(KEY)
     if not isinstance(exported, dict) or not isinstance(exported.get("recipe"), dict):
         reason = "powderdsl did not write it, so its meaning is unknown"
-        fix = "`record` plays any policy, also one of another library"
+        fix = "`record` plays any policy, including those of other libraries"
         raise damaged(f"{folder} cannot be imported", reason, fix)
-    # Episodes may have been added since.
+    # Episodes may have been added later.
     return read_recipe(folder, exported["recipe"] | {"episodes": source.total_episodes})
 
 
 def _episode(source: minari.MinariDataset, number: int, recipe: Recipe) -> dict[str, Array]:
-    """The arrays of one episode, as a shard holds them. Raises ValueError."""
+    """The arrays of one episode, as in a shard. Raises ValueError."""
     (episode,) = source.iterate_episodes([number])
     length, infos = len(episode), episode.infos
     arrays = {
@@ -243,7 +243,7 @@ def _episode(source: minari.MinariDataset, number: int, recipe: Recipe) -> dict[
 
 
 def _place(dataset_id: str) -> Path:
-    """The folder of a Minari dataset. Raises ValueError if Minari does not take the id."""
+    """The folder of a Minari dataset. Raises ValueError if Minari rejects the id."""
     from minari.dataset.minari_dataset import parse_dataset_id
     from minari.storage import get_dataset_path
 

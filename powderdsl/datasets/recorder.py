@@ -1,4 +1,4 @@
-"""Recording episodes of a task. The recipe alone decides the data: see `Recipe`."""
+"""Recording episodes of a task. The data depend only on the recipe: see `Recipe`."""
 
 from __future__ import annotations
 
@@ -39,10 +39,10 @@ from powderdsl.tasks.task import Task, still_action
 
 Array = NDArray[Any]
 Progress = Callable[[float, int], None]
-"""Called with the number of episodes played, unfinished ones as fractions, and the number of all."""
+"""Called with the number of episodes played, including fractions of unfinished ones, and the total number."""
 
 PLAYING_BYTES = 1 << 30
-"""Memory limit for the episodes that are being played."""
+"""Memory limit for episodes in progress."""
 
 
 def idle_policy(program: TaskProgram) -> Policy:
@@ -56,7 +56,7 @@ SCRIPTED: dict[str, Callable[[TaskProgram], Policy | ExpertPlayer]] = {
     "random": lambda program: random_policy(program.action_nvec),
     "nothing": idle_policy,
 }
-"""Policies that need no training, by name."""
+"""Untrained policies, by name."""
 
 
 def record(
@@ -77,22 +77,22 @@ def record(
 ) -> Dataset:
     """Play whole episodes and write them to a folder.
 
-    Episode e plays world (`seed` + e) mod `worlds` of the split. A folder that has some of the shards already is
-    completed; a shard that is damaged is recorded again.
+    Episode e plays world (`seed` + e) mod `worlds` of the split. A folder that already has some of the shards is
+    completed; damaged shards are recorded again.
 
     Args:
         task: as in `TensorEnv`.
         policy: ``random``, ``nothing`` or ``expert``, or a function from observations and keys to actions: see
-            `envs.actions.Policy`. Keys follow from the seed, the episode and the action's number; a stochastic policy
-            draws by them.
-        folder: the folder to write, which is made, but not its parent.
+            `envs.actions.Policy`. Keys follow from the seed, the episode and the action's number; stochastic policies
+            should depend on them.
+        folder: the folder to write, which is created, but not its parent.
         episodes: the number of episodes.
-        seed: the world of the first episode; keys of actions depend on it too.
+        seed: the world of the first episode; keys of actions also depend on it.
         observation: ``ids``, ``compact`` or ``laws``.
         shard: episodes in a shard; by default 256, or fewer if these take more than 256 MiB.
-        compress: a seventh of the disk space for ``ids``, a quarter for ``compact``, and slower to read.
-        envs: the largest number of episodes that are played at once; it does not change the recording.
-        policy_name: the name of a function in the manifest; give each function a name of its own.
+        compress: use a seventh of the disk space for ``ids``, and a quarter for ``compact``; reading is slower.
+        envs: maximum number of episodes to play at once, which does not affect the recording.
+        policy_name: the name of a policy function in the manifest; use a different name for each function.
         sees: the form of observations for the policy, if it differs from the recorded form.
         progress: called after every action.
         how: split, knobs, params, worlds, last_action, max_episode_steps, backend, device, threads: of `TensorEnv`.
@@ -107,7 +107,7 @@ def record(
         raise ValueError(f"policy is a function, or one of {', '.join(SCRIPTED)}; found {policy!r}")
     name = policy if isinstance(policy, str) else policy_name
     if not name:
-        raise ValueError("a policy that is a function needs a policy_name, by which its data are known")
+        raise ValueError("a policy function needs a policy_name, which identifies its data")
     env = environment(task, 1, observation=observation, autoreset_mode="disabled", **how)
     recipe = recipe_of(env, policy=name, episodes=episodes, seed=seed, compress=compress, shard=shard)
     sight = observation_of(sees or observation, env.program)
@@ -124,7 +124,7 @@ def record(
 
 @contextmanager
 def lock_place(folder: Path) -> Iterator[None]:
-    """Make the folder and lock it. A new one without a shard is removed where a CompileError ends the block."""
+    """Create the folder and lock it. If a CompileError ends the block, a new folder without a shard is removed."""
     check_place(folder)
     is_new = not folder.is_dir()
     with writing(folder):
@@ -139,14 +139,14 @@ def lock_place(folder: Path) -> Iterator[None]:
 
 
 def begin_manifest(folder: Path, recipe: Recipe) -> Manifest:
-    """The manifest to continue with: a new one, or the one of the same recipe with its intact shards."""
+    """The manifest to continue: a new one, or that of the same recipe with its intact shards."""
     if not (folder / FILE).exists():
         manifest = Manifest(recipe, datetime.now(UTC).isoformat(timespec="seconds"), ())
     else:
         manifest = read_manifest(folder)
         notes = differences(asdict(manifest.recipe), asdict(recipe))
         if notes:
-            helps = ("take another folder, or the values that it was begun with",)
+            helps = ("choose another folder, or use the values that the dataset was begun with",)
             raise failure("PD631", f"{folder} has another dataset", notes=notes, helps=helps)
         intact = tuple(row for row in manifest.shards if is_whole(folder, row))
         manifest = replace(manifest, recipe=recipe, shards=intact)
@@ -200,7 +200,7 @@ class _Recording:
                 episodes = episodes[count:]
 
     def played(self, numbers: Array, done: int, progress: Progress) -> list[dict[str, Array]]:
-        """The arrays of some episodes, played at once. Those that are over run on, and no longer count."""
+        """The arrays of some episodes, played at once. Finished episodes continue to run, but are ignored."""
         recipe, count = self.recipe, len(numbers)
         env = environment(
             self.program,

@@ -1,4 +1,4 @@
-"""Diagnostics: the mistake, its place, and the fix. Used by every stage; depends on nothing."""
+"""Diagnostics: a mistake, its location, and a fix. Used by every stage, without dependencies."""
 
 from powderdsl.diagnostics.codes import CODES, Code, Severity
 from powderdsl.diagnostics.diagnostic import (

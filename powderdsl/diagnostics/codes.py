@@ -1,6 +1,6 @@
-"""The table of diagnostic codes, and the page of each: its meaning, an example, the fix.
+"""The table of diagnostic codes, and their pages: the meaning, an example, and a fix.
 
-A code is permanent: never reused, its page stays when it is retired.
+Codes are permanent: they are never reused, and a retired code keeps its page.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 
 class Severity(Enum):
-    """The weight of a diagnostic: an error stops, a warning is probably a mistake, a note is worth knowing."""
+    """The severity of a diagnostic: an error stops, a warning is probably a mistake, a note is information."""
 
     ERROR = "error"
     WARNING = "warning"
@@ -20,7 +20,7 @@ class Severity(Enum):
 
 
 class Code(NamedTuple):
-    """A row: the code, its slug (which names the fault, not the fix), and its severity."""
+    """A code, its slug (which names the fault, not the fix), and its severity."""
 
     code: str
     slug: str
@@ -134,7 +134,7 @@ _ROWS = (
     ("PD805", "constant-reward", _WARNING),
     ("PD806", "invalid-study"),
     ("PD807", "laws-not-held-out", _WARNING),
-    # PD9xx: our own mistakes
+    # PD9xx: bugs of powderdsl
     ("PD901", "internal-error"),
 )
 
@@ -151,7 +151,7 @@ def find_code(word: str) -> Code | None:
 
 
 def similar(word: str) -> tuple[str, ...]:
-    """Codes and slugs similar to an unknown one; all codes of its hundred if it looks like a code."""
+    """Codes and slugs similar to an unknown word; all codes with its first digit if it looks like a code."""
     text = word.strip().lower()
     known = {name.lower(): name for row in CODES.values() for name in (row.code, row.slug)}
     if text.startswith("pd") and len(text) >= 3:

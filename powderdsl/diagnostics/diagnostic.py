@@ -1,6 +1,6 @@
-"""Diagnostics: as data, as text with carets or JSON, and the Reporter that collects them.
+"""Diagnostics as data, as text with carets or JSON, and the Reporter that collects them.
 
-Places in source text are two character offsets; lines and columns are for printing only.
+Spans in source text are two character offsets; lines and columns are only for printing.
 """
 
 from __future__ import annotations
@@ -19,21 +19,21 @@ from powderdsl.diagnostics.printable import printable
 
 TAB_WIDTH = 4
 MAX_SHOWN = 160
-"""The most characters of a source line that a diagnostic shows."""
+"""Maximum number of characters of a source line to show."""
 COLORS = {Severity.ERROR: "31;1", Severity.WARNING: "33;1", Severity.NOTE: "36;1"}
 
 MEANT = re.compile(r"did you mean `([^`]+)`\?")
 
 MAX_ERRORS = 200
-"""The most errors that are reported: more would not be read."""
+"""Maximum number of errors to report."""
 
 MAX_CANDIDATES = 500
-"""The most names among which the one that a misspelled name means is searched; of more, only names with its first letter."""
+"""Maximum number of names to compare a misspelled name with; of more, only those with the same first letter."""
 
 
 @dataclass(frozen=True)
 class Source:
-    """A text with a name to print. Two sources are equal if name and text are."""
+    """A text with a name for messages. Sources are equal if both name and text are."""
 
     name: str
     text: str = field(repr=False)
@@ -83,13 +83,13 @@ class Span:
         return f"{self.source.name}:{line}:{column}"
 
     def to(self, other: Span) -> Span:
-        """From the start of this span to the end of `other`, which lies in the same source."""
+        """From the start of this span to the end of `other`, which is in the same source."""
         return Span(self.source, self.start, max(self.end, other.end))
 
 
 @dataclass(frozen=True)
 class Label:
-    """A place and the words that finish the sentence under its caret. `span` is None where there is no text."""
+    """A location and the text under its caret. `span` is None without source text."""
 
     span: Span | None
     text: str = ""
@@ -97,7 +97,7 @@ class Label:
 
 @dataclass(frozen=True)
 class Diagnostic:
-    """One mistake (or remark): a code of the table, the place, the message, and the fixes."""
+    """A diagnostic: its code, location and message, and fixes."""
 
     code: str
     message: str
@@ -112,14 +112,14 @@ class Diagnostic:
 
     @property
     def fix(self) -> tuple[Span, str] | None:
-        """The place of a misspelled word and the word that the help names, if it names one."""
+        """The span of a misspelled word and the suggested word, if there is one."""
         words = [match[1] for text in self.helps if (match := MEANT.fullmatch(text))]
         span = self.primary.span
         return (span, words[0]) if span is not None and len(words) == 1 and span.text.strip() else None
 
     @property
     def sort_key(self) -> tuple[str, int, int, str]:
-        """The file, the place in it, and the code. Diagnostics without a place come first."""
+        """The file, the position in it, and the code. Diagnostics without a location come first."""
         span = self.primary.span
         return (span.source.name, span.start, span.end, self.code) if span else ("", 0, 0, self.code)
 
@@ -128,12 +128,12 @@ class Diagnostic:
 
 
 def _cells(text: str) -> int:
-    """Terminal cells that `text` takes, tabs already expanded."""
+    """The width of `text` in terminal cells, with tabs already expanded."""
     return sum(0 if combining(char) else 2 if east_asian_width(char) in "WF" else 1 for char in text)
 
 
 def _snippet(label: Label, caret: str) -> tuple[str, str]:
-    """The source line and the line of carets below it, long lines cut to a window around the place."""
+    """The source line and the line of carets below it; a long line is cut to a window around the span."""
     span = label.span
     assert span is not None
     line_number, column = span.source.position(span.start)
@@ -144,7 +144,7 @@ def _snippet(label: Label, caret: str) -> tuple[str, str]:
     right = min(len(raw), left + MAX_SHOWN)
 
     def visible(piece: str) -> str:
-        # What cannot be printed takes one column, so that carets stay below their text.
+        # Unprintable characters take one column, so that carets stay below their text.
         chars = piece.expandtabs(TAB_WIDTH)
         return "".join("\N{REPLACEMENT CHARACTER}" if printable(char) != char else char for char in chars)
 
@@ -155,7 +155,7 @@ def _snippet(label: Label, caret: str) -> tuple[str, str]:
 
 
 def source_lines(labels: Sequence[Label]) -> tuple[list[str], int]:
-    """The source lines of labels with carets, the first label's as `^`; and the width of the line numbers."""
+    """The source lines of labels with carets (`^` for the first label), and the width of the line numbers."""
     placed = [label for label in labels if label.span]
     gutter = max((len(str(label.span.line)) for label in placed if label.span), default=1)
     lines: list[str] = []
@@ -221,7 +221,7 @@ def diagnostic_data(diagnostic: Diagnostic, *, utf16: bool = False) -> dict[str,
 
 
 class CompileError(Exception):
-    """Bad input: rule files, worlds, tasks. `diagnostics` has all errors, in source order."""
+    """Invalid input, such as rule files, worlds or tasks. `diagnostics` has all errors, in source order."""
 
     def __init__(self, diagnostics: Iterable[Diagnostic]):
         self.diagnostics = tuple(diagnostics)
@@ -232,7 +232,7 @@ class CompileError(Exception):
 
 
 class Reporter:
-    """Collects diagnostics. Every stage reports all it can; `raise_if_errors` ends the stage."""
+    """Collects diagnostics. Every stage reports as many as it can; `raise_if_errors` ends the stage."""
 
     def __init__(self) -> None:
         self._diagnostics: dict[Diagnostic, None] = {}
@@ -249,9 +249,9 @@ class Reporter:
         notes: Sequence[str] = (),
         helps: Sequence[str] = (),
     ) -> None:
-        """Add a diagnostic. The code's row in the table decides whether it is an error, a warning or a note.
+        """Add a diagnostic, with the severity of its code.
 
-        Raises CompileError with everything so far, when there are MAX_ERRORS errors.
+        Raises CompileError with all errors so far once there are MAX_ERRORS.
         """
         if span is not None and span.end <= span.start:
             span = Span(span.source, span.start, span.start + 1)  # something to underline
@@ -281,14 +281,14 @@ class Reporter:
         return self._errors > 0
 
     def raise_if_errors(self) -> None:
-        """Raise CompileError with the errors so far (warnings and notes stay with the reporter)."""
+        """Raise CompileError with the errors so far, if any (warnings and notes stay with the reporter)."""
         if self.has_errors:
             errors = [d for d in self.diagnostics if d.severity is Severity.ERROR]
             raise CompileError(errors)
 
 
 def suggest(word: str, candidates: Iterable[str], kind: str = "") -> tuple[str, ...]:
-    """Help lines for an unknown word: the close match, or the whole list when it is short."""
+    """Help lines for an unknown word: a close match, or the whole list if it is short."""
     word = str(word)  # callers of the Python API may pass anything
     known = sorted(set(candidates) - {word})
     if len(known) > MAX_CANDIDATES:

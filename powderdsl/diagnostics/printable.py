@@ -1,6 +1,6 @@
-"""Text from files and arguments, made safe to print: a terminal obeys some characters, and readers do not see others.
+"""Escaping of text from files and arguments: terminals interpret some characters, and others are invisible.
 
-`PrintableStream` stands before stdout and stderr while a command runs, so whatever any code prints is escaped. Code that
+`PrintableStream` wraps stdout and stderr while a command runs, so that all output is escaped. Code that
 draws on the terminal writes to `unguarded(stream)` and escapes the text in its drawing with `printable` itself.
 """
 
@@ -14,15 +14,15 @@ from contextlib import contextmanager
 from typing import Any, TextIO, cast
 
 _CONTROLS = "\x00-\x1f\x7f-\x9f"
-"""C0 and C1: escape sequences begin with one, and others move the cursor."""
+"""C0 and C1 control characters, which begin escape sequences or move the cursor."""
 _FORMATS = (
     "\u00ad\u0600-\u0605\u061c\u06dd\u070f\u0890\u0891\u08e2\u180e\u200b-\u200f\u2028-\u202e\u2060-\u206f\ufeff"
     "\ufff9-\ufffb\U000110bd\U000110cd\U00013430-\U0001345f\U0001bca0-\U0001bca3\U0001d173-\U0001d17a"
     "\U000e0000-\U000e0fff"
 )
-"""Characters that have no shape of their own: marks of direction, joiners, separators of lines, tags."""
+"""Invisible characters: direction marks, joiners, line separators, tags."""
 _BLANKS = "\u115f\u1160\u3164\uffa0"
-"""Letters that are blank."""
+"""Blank letters."""
 _SURROGATES = "\ud800-\udfff"
 """Bytes of file names that are not UTF-8."""
 
@@ -33,10 +33,10 @@ _STYLE = re.compile(r"(\x1b\[[0-9;]*m)")
 def printable(text: str, *, lines: bool = False) -> str:
     """A text with every character that a terminal obeys or does not show as ``\\uXXXX``, as JSON writes it.
 
-    That covers control characters (also C1, which some terminals obey), marks of direction, characters without a
-    shape, and bytes that are not UTF-8. JSON stays the same JSON.
+    These are control characters (also C1, which some terminals interpret), direction marks, invisible characters, and
+    bytes that are not UTF-8. JSON keeps its meaning.
 
-    `lines`: keep line breaks and tabs, which one line of a message cannot have.
+    `lines`: keep line breaks and tabs, which a message of one line must not contain.
     """
     return _UNPRINTABLE.sub(
         lambda match: match[0] if lines and match[0] in "\t\n" else _escaped(match[0]), text
@@ -54,21 +54,21 @@ def _escaped(char: str) -> str:
     return "".join(f"\\u{units[at : at + 2].hex()}" for at in range(0, len(units), 2))
 
 
-# Letters that look like others
+# Letters that look like other letters
 
 
 def spell(word: str) -> str:
     """An identifier as a message should print it: letters that only look like ASCII ones as ``\\uXXXX``.
 
-    A word in another script stays as it is; a word that mixes ASCII with other scripts, or with other forms of Latin
-    letters (full width, mathematical), does not.
+    A word in another script is unchanged; one that mixes ASCII with other scripts, or with other forms of Latin letters
+    (full width, mathematical), is escaped.
     """
     odd = set(look_alikes(word))
     return "".join(_escaped(char) if char in odd else char for char in printable(word))
 
 
 def look_alikes(word: str) -> tuple[str, ...]:
-    """The characters of a word that may be taken for others, in order, each once; `character_name` says what they are."""
+    """The distinct characters of a word that may be confused with others, in order; see `character_name`."""
     mixed = any(char.isascii() and char.isalpha() for char in word)
     odd = (
         char
@@ -96,7 +96,7 @@ def shown_character(char: str) -> str:
 
 
 class PrintableStream:
-    """A text stream that escapes what is written to it. It has no `buffer`, so nothing passes it by."""
+    """A text stream that escapes what is written to it. It has no `buffer`, so nothing bypasses it."""
 
     def __init__(self, stream: TextIO):
         self.unguarded: TextIO = raw_stream(stream)
@@ -117,7 +117,7 @@ class PrintableStream:
 
 @contextmanager
 def printable_streams() -> Iterator[None]:
-    """Escape what is printed inside the block, to stdout and to stderr."""
+    """Escape everything printed inside the block, to stdout and stderr."""
     before = sys.stdout, sys.stderr
     sys.stdout, sys.stderr = (cast(TextIO, PrintableStream(stream)) for stream in before)
     try:
@@ -132,5 +132,5 @@ def raw_stream(stream: Any) -> Any:
 
 
 def write_styled(stream: Any, text: str) -> None:
-    """Write a text that has colors of ours to any stream: see `styled`."""
+    """Write a text with our own colors to any stream: see `styled`."""
     raw_stream(stream).write(styled(text))

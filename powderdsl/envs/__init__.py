@@ -1,7 +1,7 @@
 """Tasks as environments for reinforcement learning. Importing this registers the shipped ones with Gymnasium.
 
-`TensorEnv` takes and gives tensors; `PowderVectorEnv` and `PowderEnv` are its faces for Gymnasium, and
-`powderdsl.envs.sb3.PowderVecEnv` for Stable-Baselines3. Registering needs no torch: names are imported when first used.
+`TensorEnv` takes and returns tensors; `PowderVectorEnv` and `PowderEnv` wrap it for Gymnasium, and
+`powderdsl.envs.sb3.PowderVecEnv` for Stable-Baselines3. Registering needs no torch: names are imported lazily.
 """
 
 from __future__ import annotations
@@ -28,8 +28,8 @@ def env_id(task: str) -> str:
 
 for _task in shipped_tasks():
     if env_id(_task) not in gymnasium.registry:
-        # Episodes end by themselves: no limit is set here, so `make` adds no `TimeLimit`, and the last action of a task
-        # may terminate an episode without truncating it. Environments fill `spec.max_episode_steps` in.
+        # Environments end episodes themselves and fill in `spec.max_episode_steps`. Without a limit here, `make` adds
+        # no `TimeLimit`, and the last action of a task may terminate an episode without truncating it.
         gymnasium.register(
             env_id(_task),
             entry_point="powderdsl.envs.gym:PowderEnv",

@@ -1,4 +1,4 @@
-"""The forms in which environments take actions, their mapping to the five numbers that tasks take, and policies."""
+"""Forms of actions, their mapping to the five numbers that tasks take, and policies."""
 
 from __future__ import annotations
 
@@ -19,40 +19,40 @@ from powderdsl.tasks.task import BLOW, NO_CHANGE, Agent
 KINDS = ("multidiscrete", "discrete", "full")
 
 MAX_ACTIONS = 1 << 20
-"""The most actions of a discrete form."""
+"""Maximum number of actions of the discrete form."""
 
 UNREAD = (0, 0, 0, 1, 1)
-"""The values of numbers that nothing reads; vx and vy are those of a blow that moves nothing."""
+"""The values of unused numbers; vx and vy are those of a blow without effect."""
 
 
 @dataclass(frozen=True, eq=False)
 class ActionForm:
-    """A form of the actions of one agent. Made by `action_form`; its tensors lie on one device.
+    """A form of the actions of one agent, created by `action_form`. Its tensors are on one device.
 
-    ``full``: the five numbers x, y, choice, vx, vy. ``multidiscrete``: those of them that one of the agent's choices reads
-    and that can have several values; the choice alone if there are none. ``discrete``: one number, of which each value
-    does something different, see `table`.
+    ``full``: the five numbers x, y, choice, vx, vy. ``multidiscrete``: those of them that one of the agent's choices
+    uses and that can have several values; only the choice if there are none. ``discrete``: one number, each value of
+    which has a different effect (see `table`).
     """
 
     kind: str
     space: Discrete[Any] | MultiDiscrete
     """Of one action."""
     names: tuple[str, ...]
-    """What each number of an action says."""
+    """The name of each number of an action."""
     nvec: tuple[int, ...]
-    """How many values each number of an action has."""
+    """The number of values of each number of an action."""
     mask: Tensor
-    """bool [sum of `nvec`]: which values of the first number, then of the next, are allowed. Only `full` has others: of a
-    number that nothing reads, one value is allowed."""
+    """bool [sum of `nvec`]: the allowed values of the first number, then of the next, …. Only `full` has disallowed
+    values: an unused number has a single allowed value."""
     full_nvec: tuple[int, ...]
-    """How many values the five numbers have."""
+    """The number of values of each of the five numbers."""
     columns: Tensor
-    """int64 [k]: which of the five numbers stand in an action, if it is not ``discrete``."""
+    """int64 [k]: which of the five numbers an action contains, unless it is ``discrete``."""
     table: Tensor
     """The five numbers of each value of a ``discrete`` action, int64 [n, 5]; of other forms UNREAD, [1, 5].
 
-    Values are ordered by what is done, then by y, then by x: ``value = (what · rows + y) · columns + x``. What is done are
-    the agent's choices in order; blowing counts once for each (vy, vx), vx counting fastest. Doing nothing has no place,
+    Values are ordered by operation, then by y, then by x: ``value = (operation · rows + y) · columns + x``. Operations
+    are the agent's choices in order, with one blow for each (vy, vx), vx varying fastest. Doing nothing has no location
     and is the last value.
     """
     weights: Tensor
@@ -77,7 +77,7 @@ class ActionForm:
         return self.table.expand(len(numbers), -1).clone().index_copy_(1, self.columns, numbers)
 
     def encode(self, numbers: Any) -> Tensor:
-        """The actions in this form, int64 [B] or [B, k], that do the same as five numbers each, [B, 5].
+        """The actions in this form, int64 [B] or [B, k], that are equivalent to five numbers each, [B, 5].
 
         Raises as `decode`.
         """
@@ -150,18 +150,18 @@ def _discrete(agent: Agent) -> tuple[Tensor, Tensor]:
 # Policies: random numbers are hashes, so that no batch changes them
 
 Policy = Callable[[Tensor, Tensor], Tensor]
-"""From observations [B, …] and keys, int64 [B], to actions int64 [B, 5]. Keys are what random numbers depend on."""
+"""From observations [B, …] and keys, int64 [B], to actions int64 [B, 5]. Random numbers depend on the keys."""
 
 
 class FrameStack:
-    """The last observations of episodes, stacked along their channels, oldest first: zeros before an episode began."""
+    """The last observations of episodes, stacked along their channels, oldest first; zeros before an episode began."""
 
     def __init__(self, frames: int):
         self.frames = frames
         self._kept: Tensor | None = None
 
     def push(self, observed: Tensor, fresh: Tensor | None = None) -> Tensor:
-        """The stack [B, frames · C, …] after observations [B, C, …]; `fresh`, bool [B]: whose episode begins with them."""
+        """The stack [B, frames · C, …] after observations [B, C, …]; `fresh`, bool [B], marks new episodes."""
         if self.frames == 1:
             return observed
         channels = observed.shape[1]
@@ -174,7 +174,7 @@ class FrameStack:
 
 
 def random_policy(nvec: tuple[int, ...]) -> Policy:
-    """All actions equally likely."""
+    """Uniformly random actions."""
 
     def act(observed: Tensor, keys: Tensor) -> Tensor:
         counts = torch.tensor(nvec, device=keys.device)

@@ -1,4 +1,4 @@
-"""Environments whose step is one call of native code: actions, simulation, rewards, ends, new episodes, observations."""
+"""Environments whose whole step, from actions to observations, is one call of native code."""
 
 from __future__ import annotations
 
@@ -25,22 +25,22 @@ Steps = tuple[Any, Any, Any, Any, dict[str, Any]]
 
 
 class CompiledEnv(TensorEnv):
-    """A `TensorEnv` that steps by one call of native code, with the same results; without native code it steps as before.
+    """A `TensorEnv` whose step is one call of native code, if there is native code, with the same results.
 
-    Measures that bit planes do not show (`Stepper.measures_cells`) are taken of tensors, between two calls.
+    Measures that bit planes cannot give (`Stepper.measures_cells`) are computed from tensors between two calls.
     """
 
     _stepper: Stepper | None = None
     _results: Sequence[Results] = ()
     _bound: tuple[Any, Any] = (None, None)
-    """The episodes and parameters that the stepper steps."""
+    """The episodes and parameters of the stepper."""
 
     def _ready(self) -> Stepper | None:
-        """Return what steps the current episodes; None if they do not run as native code."""
+        """Return the stepper of the current episodes; None if they do not run as native code."""
         if self.episodes is self._bound[0] and self.params is self._bound[1]:
             return self._stepper
         self._bound = None, None
-        if self.curriculum is not None:  # start worlds made ahead would be chosen too early
+        if self.curriculum is not None:  # start worlds would be chosen too early if made ahead
             return None
         native = self.simulator.native(self.task.size[1])
         if native is None or self.episodes is None:
@@ -82,7 +82,7 @@ class CompiledEnv(TensorEnv):
         return torch.from_numpy(results.observed), info
 
     def _write_laws(self, results: Results, ended: Any) -> None:
-        """Write laws behind the elements, if observations have them; `ended`: whose last observations there are."""
+        """Write laws after the elements, if observations have them; `ended`: the episodes with last observations."""
         if self.observation.kind != "laws":
             return
         assert self.episodes is not None
@@ -94,12 +94,12 @@ class CompiledEnv(TensorEnv):
             lasts[: np.count_nonzero(ended), 1, :count] = before[ended]
 
     def _numbers(self, rows: Tensor, episodes: Tensor) -> Tensor:
-        """Return the numbers of the worlds that rows play in episodes: int64 [n]."""
+        """Return the numbers of the worlds of episodes of environments: int64 [n]."""
         assert self._base is not None
         return world_seeds(self._base[rows], episodes, self.worlds)
 
     def _new_results(self, stepper: Stepper) -> Results:
-        """Return results that nobody holds, which the next call writes to."""
+        """Return unreferenced results for the next call to write to."""
         fitting = (results for results in self._results if len(results.everyone) == self.num_envs)
         results = next(filter(Results.is_free, fitting), None)
         if results is None:
@@ -114,7 +114,7 @@ class CompiledEnv(TensorEnv):
         return results
 
     def step(self, actions: Any) -> tuple[Tensor, Tensor, Tensor, Tensor, Info]:
-        """Act once in every episode: see `TensorEnv.step`."""
+        """Take one action in every episode: see `TensorEnv.step`."""
         if self._ready() is None:
             return super().step(actions)
         *parts, info = self.step_arrays(actions)
@@ -122,7 +122,7 @@ class CompiledEnv(TensorEnv):
         return observed, reward, terminated, truncated, tensors_of(info)
 
     def step_arrays(self, actions: Any) -> Steps:
-        """Act once in every episode: `step` with NumPy arrays."""
+        """Take one action in every episode: `step` with NumPy arrays."""
         stepper = self._ready()
         if stepper is None:
             *parts, shown = super().step(actions)
@@ -168,7 +168,7 @@ class CompiledEnv(TensorEnv):
 
 
 def plan_arguments(env: TensorEnv, places: Places) -> tuple[Any, ...]:
-    """Return the arguments of `Plan` after its first two, for what an environment's step does."""
+    """Return the arguments of `Plan` after the first two, for the step of an environment."""
     form, space, size = env.action_form, env.observation.space, env.task.size
     assert space.dtype is not None
     kind = "ids" if env.observation.kind == "laws" else env.observation.kind
@@ -185,7 +185,7 @@ def plan_arguments(env: TensorEnv, places: Places) -> tuple[Any, ...]:
 
 
 def arrays_of(info: Info) -> dict[str, Any]:
-    """The infos of a `TensorEnv` as arrays; from a device they are copied."""
+    """The infos of a `TensorEnv` as arrays, copied from a device."""
     return {
         name: arrays_of(value) if isinstance(value, dict) else value.cpu().numpy()
         for name, value in info.items()
@@ -193,7 +193,7 @@ def arrays_of(info: Info) -> dict[str, Any]:
 
 
 def tensors_of(info: Mapping[str, Any]) -> Info:
-    """Infos of arrays as tensors of the same memory."""
+    """Infos of arrays as tensors that share their memory."""
     return {
         name: tensors_of(value) if isinstance(value, dict) else torch.from_numpy(value)
         for name, value in info.items()

@@ -1,4 +1,4 @@
-"""Curricula: the choice of the worlds, and so of the laws, that an agent trains in next."""
+"""Curricula, which choose the worlds, and thereby the laws, in which an agent trains next."""
 
 from __future__ import annotations
 
@@ -18,30 +18,30 @@ class Curriculum(Protocol):
     """Chooses the worlds of episodes, and receives a score for each episode."""
 
     def choose(self, base: Tensor, episode: Tensor, drawn: Tensor) -> Tensor:
-        """Return the worlds, int64 [n], of environments' episodes: `drawn`, those of an even choice, or others.
+        """Return the worlds, int64 [n], of environments' episodes: `drawn` (chosen uniformly), or others.
 
         `base` and `episode`, int64 [n], are the seeds of the environments and the numbers of the episodes.
         """
 
     def learn(self, worlds: Tensor, scores: Tensor) -> None:
-        """Record scores, float64 [n], of the worlds of episodes, int64 [n]: a high score means that there is more to learn."""
+        """Record scores, float64 [n], of the worlds of episodes, int64 [n]. A higher score means more to learn."""
 
     def state(self) -> dict[str, Tensor]:
         """Return everything that later choices depend on."""
 
     def restore(self, state: Mapping[str, Any]) -> None:
-        """Continue from a result of `state`. Raises KeyError for anything else."""
+        """Restore a result of `state`. Raises KeyError for anything else."""
 
 
 class Prioritized:
     """Prioritized level replay (Jiang, Grefenstette and Rocktäschel, ICML 2021).
 
-    An episode plays a world again with the chance `replay`. Which one is drawn by the rank of scores, with chances that
-    fall as a power of the rank, and, for a `stale` part, by how long a world has not been played.
+    An episode replays a world with probability `replay`. The world is drawn by the rank of its score, with
+    probabilities that fall as a power of the rank, and with weight `stale` by the time since it was last played.
 
     Args:
-        worlds: how many are remembered, those of the highest scores.
-        power: of the rank, the inverse of the paper's temperature.
+        worlds: number of worlds to remember, those with the highest scores.
+        power: exponent of the rank, the inverse of the paper's temperature.
     """
 
     def __init__(self, worlds: int = 1024, replay: float = 0.5, stale: float = 0.1, power: float = 10.0):
@@ -80,7 +80,7 @@ class Prioritized:
         self._played = torch.tensor([played for _, (_, played) in rows], dtype=torch.int64)
 
     def state(self) -> dict[str, Tensor]:
-        """Return the worlds, their scores and when they were played."""
+        """Return the worlds, their scores and when each was last played."""
         return {name: getattr(self, f"_{name}") for name in ("worlds", "scores", "played", "time")}
 
     def restore(self, state: Mapping[str, Any]) -> None:

@@ -1,4 +1,4 @@
-"""Feature extractors for Stable-Baselines3: bytes become channels on the device, then the paper's network or a small one."""
+"""Feature extractors for Stable-Baselines3: the paper's network or a small one, on channels unpacked on the device."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ from torch import Tensor, nn
 from powderdsl.envs.tensor_env import TensorEnv
 
 FEWEST, MOST = 8, 32
-"""Patches along a side: as many as the agent has bins, within these bounds."""
+"""Bounds of the number of patches per side, which is otherwise the agent's number of bins."""
 
 LAW_FEATURES = 16
-"""Numbers that a network makes of laws."""
+"""Number of features that a network computes from laws."""
 
 
 class Expand(nn.Module):
     """The channels of ``matrix``, float32 [B, C, H, W], from observations ``ids`` or ``compact``.
 
-    `sources`: the channel of the observation that each comes from. `tables`: [C, 256], what it is by the number there.
+    `sources`: the observation's channel for each. `tables`: [C, 256], its value for each number there.
     """
 
     def __init__(self, sources: tuple[int, ...], tables: Tensor):
@@ -43,14 +43,14 @@ class Expand(nn.Module):
 class MatrixPatches(nn.Module):
     """From `matrix` observations, float32 [B, C, H, W], to [B, C, rows, columns]: the mean of each channel in each patch.
 
-    Nothing in here is learned, so no gradient passes through.
+    It has no parameters, so it needs no gradient.
     """
 
     def __init__(self, channels: int, size: tuple[int, int], patches: tuple[int, int]):
         super().__init__()
         self.channels, self.patches = channels, patches
         self.places = [torch.arange(side) * count // side for side, count in zip(size, patches, strict=True)]
-        """The row (and column) of patches that each row (and column) of cells lies in."""
+        """The row (and column) of patches that contains each row (and column) of cells."""
         shares = [
             nn.functional.one_hot(places, count).float()
             for places, count in zip(self.places, patches, strict=True)
@@ -64,12 +64,12 @@ class MatrixPatches(nn.Module):
 
 
 class Patches(MatrixPatches):
-    """From bytes uint8 [B, C, H, W] to float32 [B, E + C − 1, rows, columns]: how much of each patch each element
-    takes, and the means of all other channels.
+    """From bytes uint8 [B, C, H, W] to float32 [B, E + C − 1, rows, columns]: the share of each element in each patch,
+    and the means of all other channels.
 
     Args:
-        elements: how many element ids there are. size: rows and columns of worlds. patches: of patches.
-        values: [C, 256], what the bytes of each channel stand for; those of the first are not used.
+        elements: number of element ids. size: rows and columns of worlds. patches: rows and columns of patches.
+        values: [C, 256], the value of each byte of each channel; the first channel's are not used.
     """
 
     def __init__(self, elements: int, size: tuple[int, int], patches: tuple[int, int], values: Tensor):
@@ -78,16 +78,16 @@ class Patches(MatrixPatches):
         first = (self.places[0][:, None] * patches[1] + self.places[1]) * elements
         self.register_buffer("first", first.to(torch.int32))
         rows, columns = self.get_buffer("rows").T, self.get_buffer("columns")
-        share = rows.amax(0)[:, None] * columns.amax(0)  # one cell's part of its patch
+        share = rows.amax(0)[:, None] * columns.amax(0)  # one cell's share of its patch
         self.register_buffer("share", share[..., None].contiguous())
         wide = share[..., None].repeat(1, 1, elements)  # in the shape of counts, which is faster
         self.register_buffer("shares", wide, persistent=False)
         self.register_buffer("values", values.float().cpu())
         self.one_channel = len(values) == 1 < patches[0]
-        """Whether `count` gives all there is to see, in another shape than observations have."""
+        """True if `count` returns the whole observation in another shape."""
 
     def count(self, observed: Tensor) -> Tensor:
-        """How many cells of each patch each element takes, int64 [B, rows, columns, E]."""
+        """The number of cells of each element in each patch, int64 [B, rows, columns, E]."""
         batch, count = len(observed), self.patches[0] * self.patches[1] * self.elements
         start = torch.arange(batch, dtype=torch.int32, device=observed.device) * count
         number = observed[:, 0].int().add_(self.get_buffer("first")).add_(start[:, None, None])
@@ -95,9 +95,9 @@ class Patches(MatrixPatches):
         return counts.view(batch, *self.patches, self.elements)
 
     def forward(self, observed: Tensor) -> Tensor:
-        """Bytes, or the same numbers as floats; if they have one channel, also what `count` made of them."""
+        """Bytes, or the same numbers as floats; with a single channel, also results of `count`."""
         counts = observed if self.one_channel and observed.shape[1] > 1 else self.count(observed)
-        parts = [(counts * self.get_buffer("shares")).permute(0, 3, 1, 2)]  # channels are the last in memory
+        parts = [(counts * self.get_buffer("shares")).permute(0, 3, 1, 2)]  # channels last in memory
         values = self.get_buffer("values")
         for channel in range(1, len(values)):
             cells = values[channel].index_select(0, observed[:, channel].int().flatten())
@@ -109,7 +109,7 @@ class LawPatches(nn.Module):
     """From `laws` observations to patches of the elements, and features of the laws, which are the same in every patch.
 
     Args:
-        see: makes patches of element ids.
+        see: maps element ids to patches.
         laws: bytes of laws.
     """
 
@@ -139,10 +139,11 @@ class Frames(nn.Module):
 
 
 class Features(BaseFeaturesExtractor):
-    """Two convolutions on what `see` makes of observations, and a fully connected layer.
+    """`see`, two convolutions, and a fully connected layer.
 
     Args:
-        channels: of what `see` makes. widths: features of the two convolutions. strides: (kernel, stride, padding) of both.
+        channels: channels from `see`. widths: features of the two convolutions. strides: their (kernel, stride,
+            padding).
     """
 
     def __init__(
@@ -188,10 +189,10 @@ def paper_policy(env: TensorEnv, features_dim: int = 256, frames: int = 1) -> di
     """`policy_kwargs` of ``CnnPolicy`` for the observations of an environment: the paper's network.
 
     Two convolutions of kernel 3 with 32 and 64 features, and a fully connected layer; the policy's own layer is the
-    second. The paper does not give the stride; with 2, the fully connected layer has a sixteenth of the weights.
+    second. The paper does not state the stride; with 2, the fully connected layer has a sixteenth of the weights.
 
     Args:
-        frames: how many observations are stacked, as `VecFrameStack` of Stable-Baselines3 does.
+        frames: number of stacked observations, as in `VecFrameStack` of Stable-Baselines3.
 
     Raises:
         ValueError: for observations that are pictures.
@@ -209,9 +210,9 @@ def paper_policy(env: TensorEnv, features_dim: int = 256, frames: int = 1) -> di
 
 
 def small_policy(env: TensorEnv, features_dim: int = 128, frames: int = 1) -> dict[str, Any]:
-    """`policy_kwargs` of ``CnnPolicy`` for the observations of an environment: a small network for processors.
+    """`policy_kwargs` of ``CnnPolicy`` for the observations of an environment: a small network for CPUs.
 
-    It counts what lies in each patch of cells, and runs convolutions on the counts. `frames`: see `paper_policy`.
+    It counts the elements in each patch of cells, and runs convolutions on the counts. `frames`: see `paper_policy`.
     Raises ValueError for observations that are pictures.
     """
     rows, columns = (

@@ -1,4 +1,4 @@
-"""Gymnasium environments over `TensorEnv`, with NumPy arrays: many worlds in one batched simulation, or one world.
+"""Gymnasium environments that wrap `TensorEnv` with NumPy arrays: many worlds in one batched simulation, or one.
 
 `GoalEnv` is for goal-conditioned use, as Gymnasium-Robotics and hindsight replay (HER) expect it.
 """
@@ -36,7 +36,7 @@ RENDER_MODES = ("rgb_array", "ansi")
 
 
 def array(tensor: Tensor) -> Array:
-    """A tensor as an array; from a device it is copied."""
+    """A tensor as an array, copied from a device."""
     return tensor.cpu().numpy()
 
 
@@ -49,7 +49,7 @@ def objects(rows: Array, mask: Array) -> Array:
 
 
 class Face:
-    """The base of environments that show a `TensorEnv` to a library: their pictures and their spec."""
+    """The base of environments that wrap a `TensorEnv` for a library: pictures and spec."""
 
     tensors: CompiledEnv
     """The same environment for tensors."""
@@ -58,7 +58,7 @@ class Face:
     _spec: EnvSpec | None = None
 
     def _show(self, task: Any, how: Mapping[str, Any], **fixed: Any) -> None:
-        """Make the environment for tensors; `how` and `fixed` are its arguments, the spec has those of `how`."""
+        """Create the environment for tensors; `how` and `fixed` are its arguments, of which the spec records `how`."""
         how = {"render_mode": None, "render_scale": 8, "actions": "multidiscrete", **how}
         rest = {**how, **fixed}
         self.render_mode, self.render_scale = rest.pop("render_mode"), rest.pop("render_scale")
@@ -74,7 +74,7 @@ class Face:
 
     @property
     def spec(self) -> EnvSpec | None:
-        """The spec of `gymnasium.make`. `max_episode_steps` tells the actions of an episode; no wrapper enforces it."""
+        """The spec of `gymnasium.make`. `max_episode_steps` is the number of actions; no wrapper enforces it."""
         return self._spec
 
     @spec.setter
@@ -97,15 +97,15 @@ class Face:
 
 
 class PowderVectorEnv(Face, VectorEnv[Any, Any, Any]):
-    """Many worlds of a task, stepped together. Returned arrays are never written to later.
+    """Many worlds of a task, stepped together. Returned arrays are never overwritten.
 
     Args:
         task: as in `TensorEnv`.
         num_envs: the number of worlds, B.
         autoreset_mode: as in `TensorEnv`; the default is Gymnasium's, which its wrappers expect.
-        how: all other arguments of `TensorEnv`; ``actions`` is ``multidiscrete`` unless given, which leaves out the
-            numbers that the task does not read. ``render_mode``: ``rgb_array`` (uint8 pictures) or ``ansi`` (text), of
-            each world. ``render_scale``: pixels along a cell's side.
+        how: all other arguments of `TensorEnv`. The default of ``actions`` is ``multidiscrete``, which omits numbers
+            that the task does not use. ``render_mode``: ``rgb_array`` (uint8 pictures) or ``ansi`` (text), of each
+            world. ``render_scale``: pixels per side of a cell.
 
     Raises:
         CompileError: as in `TensorEnv`.
@@ -136,14 +136,14 @@ class PowderVectorEnv(Face, VectorEnv[Any, Any, Any]):
     def reset(
         self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Array, dict[str, Any]]:
-        """Begin episodes: `TensorEnv.reset` with arrays."""
-        observed, info = self.tensors.reset(seed=seed, options=options)  # first: a bad seed changes nothing
+        """Begin new episodes: `TensorEnv.reset` with arrays."""
+        observed, info = self.tensors.reset(seed=seed, options=options)  # first: it checks the seed
         if isinstance(seed, int):
             super().reset(seed=seed)
         return array(observed), arrays_of(info)
 
     def step(self, actions: Any) -> tuple[Array, Array, Array, Array, dict[str, Any]]:
-        """Act once in every world: `TensorEnv.step` with arrays.
+        """Take one action in every world: `TensorEnv.step` with arrays.
 
         Returns:
             Observations [B, …], reward float32 [B], terminated and truncated bool [B], and infos; ``final_obs`` is an
@@ -165,9 +165,9 @@ class PowderVectorEnv(Face, VectorEnv[Any, Any, Any]):
 
 
 class PowderEnv(Face, gymnasium.Env[Array, Any], EzPickle):
-    """One world: the same episodes as environment 0 of a `PowderVectorEnv` with the same seed.
+    """One world, with the same episodes as environment 0 of a `PowderVectorEnv` with the same seed.
 
-    Pickling keeps the arguments of the environment, not its world.
+    Pickling preserves the arguments of the environment, not its world.
 
     Args:
         task: as in `TensorEnv`.
@@ -189,13 +189,13 @@ class PowderEnv(Face, gymnasium.Env[Array, Any], EzPickle):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Array, dict[str, Any]]:
-        """Begin an episode. Seeds and options are those of `TensorEnv.reset`, infos those of `step`."""
+        """Begin a new episode. Seeds and options are those of `TensorEnv.reset`, infos those of `step`."""
         observed, info = self.tensors.reset(seed=seed, options=options)
         super().reset(seed=seed)
         return array(observed[0]), self._info(info)
 
     def step(self, action: Any) -> tuple[Array, float, bool, bool, dict[str, Any]]:
-        """Act once.
+        """Take one action.
 
         Returns:
             The observation, the reward, terminated, truncated, and infos: ``success``, ``world``, and the
@@ -227,12 +227,12 @@ class GoalEnv(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
     """A goal-conditioned wrapper. Goals are values of the task's measures, such as a count in a region.
 
     Observations are a dict: ``observation``; ``achieved_goal``, float32 [n], the n measures in the task's reward and
-    `end`, in the order of their first use; ``desired_goal``, float32 [n]. The reward is 0 if
-    ``|achieved − desired| ≤ tolerance`` for every measure, else −1. Episodes last as long as the task's.
+    `end`, in the order of their first use; ``desired_goal``, float32 [n]. The reward is 0 if ``|achieved − desired| ≤
+    tolerance`` for every measure, else −1. Episodes are as long as the task's.
 
     Args:
-        env: a `PowderEnv`, perhaps in wrappers, as `gymnasium.make` returns it.
-        low: [n], the smallest goals. A goal is drawn once an episode, by the environment's seed.
+        env: a `PowderEnv`, possibly wrapped, as returned by `gymnasium.make`.
+        low: [n], the smallest goals. A goal is drawn once per episode, from the environment's seed.
         high: [n], the largest goals.
         tolerance: [n], or one number.
 
@@ -281,7 +281,7 @@ class GoalEnv(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         return self._with_goals(observed), info
 
     def step(self, action: Any) -> tuple[dict[str, Array], float, bool, bool, dict[str, Any]]:
-        """Act once. Infos add ``is_success``, true if the goal is met, and ``task_reward``, the reward of the task."""
+        """Take one action. Infos add ``is_success`` (the goal is met) and ``task_reward``, the reward of the task."""
         observed, task_reward, terminated, truncated, info = self.env.step(action)
         observation = self._with_goals(observed)
         reward = float(self.compute_reward(observation["achieved_goal"], observation["desired_goal"], info))
@@ -295,7 +295,7 @@ class GoalEnv(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
 
     def _with_goals(self, observed: Any) -> dict[str, Array]:
         tensors = self._tensors
-        assert tensors.episodes is not None  # reset and step have begun them
+        assert tensors.episodes is not None  # begun by reset and step
         measured = tensors.program.measured(tensors.episodes, tensors.params)
         achieved = measured[0].cpu().numpy().astype(np.float32)
         return {"observation": observed, "achieved_goal": achieved, "desired_goal": self.goal.copy()}

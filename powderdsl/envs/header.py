@@ -1,4 +1,4 @@
-"""A task's environment for programs in C: a header, and a C++ file with the rules, the task and start worlds."""
+"""A task's environment for C programs: a header, and a C++ file with the rules, the task and start worlds."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ SETTINGS = (
     *("threads", "steps", "free_steps", "actions", "limit", "mode", "last_terminates", "counts_always"),
     *("numbers", "fresh_count", "counts_painted", "element", "element_bits", "measures", "views", "size"),
 )
-"""Whole numbers of `Play` that worlds do not change."""
+"""Integers of `Play` that worlds do not change."""
 
 C_TYPES = {"uint8": "uint8_t", "int32": "int", "int64": "int64_t", "float32": "float", "float64": "double"}
 
@@ -36,9 +36,10 @@ class CEnvironment(NamedTuple):
 
 
 def c_environment(env: TensorEnv, worlds: int, name: str) -> CEnvironment:
-    """Write an environment whose episodes begin in the worlds 0 to `worlds` − 1 of its split. Episodes restart by themselves.
+    """Write an environment whose episodes begin in worlds 0 to `worlds` − 1 of its split and restart automatically.
 
-    `name`: the file name of the header. Raises CompileError: PD702 if bit planes do not show all that a step needs.
+    `name`: the file name of the header. Raises CompileError (PD702) if bit planes do not show everything that a step
+    needs.
     """
     ruleset, size, split = env.task.ruleset, env.task.size, env.task.split(env.split)
     if split.params or split.rulesets:
@@ -79,7 +80,7 @@ def _text(name: str) -> str:
 
 
 def _tables(env: TensorEnv, plan: Plan, places: Places, episodes: Episodes) -> Iterator[str]:
-    """Yield the tables of a task and `describe`, which fills in what worlds do not change."""
+    """Yield the tables of a task, and `describe`, which fills in what worlds do not change."""
     assignments = [f"p.{name} = {int(getattr(plan.play, name))};" for name in SETTINGS]
     names: dict[str, str] = {}
     for number, (name, values) in enumerate(plan.arrays.items()):
@@ -138,7 +139,7 @@ def _tables(env: TensorEnv, plan: Plan, places: Places, episodes: Episodes) -> I
 
 
 def _worlds(env: TensorEnv, places: Places, episodes: Episodes) -> Iterator[str]:
-    """Yield the start worlds: each piece of the state in runs, or by a table of what elements begin with."""
+    """Yield the start worlds: each piece of the state in runs, or by a table of the elements' initial values."""
     worlds, (rows, columns) = len(episodes), env.task.size
     yield f"constexpr int ROWS = {rows}, COLUMNS = {columns}, WORLDS = {worlds};"
     ids = episodes.world.state["element"].numpy()
@@ -165,7 +166,7 @@ def _worlds(env: TensorEnv, places: Places, episodes: Episodes) -> Iterator[str]
 
 
 def _words(values: Any) -> Any:
-    """Return the bits of values as whole numbers of 32 bits, int64."""
+    """Return the bits of values as 32-bit integers, int64."""
     whole = {1: np.uint8, 2: np.uint16, 4: np.uint32}[values.dtype.itemsize]
     return np.ascontiguousarray(values).view(whole).astype(np.int64)
 
@@ -177,7 +178,7 @@ def _array(kind: str, name: str, items: Iterable[object]) -> str:
 
 
 def _numbers(name: str, values: Any) -> str:
-    """Return the definition of an array of a tensor's or array's numbers, exactly."""
+    """Return the definition of a C array with exactly the numbers of a tensor or array."""
     array = np.ascontiguousarray(values).reshape(-1)
     texts = [float(value).hex() for value in array] if array.dtype.kind == "f" else map(str, array.tolist())
     return _array(C_TYPES[array.dtype.name], name, texts)

@@ -1,4 +1,4 @@
-"""Environments whose worlds run under different rulesets. `environment` makes them, and the others."""
+"""Environments whose worlds run under different rulesets, and `environment`, which creates all kinds."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ Array = np.ndarray[Any, Any]
 
 
 def environment(task: str | Path | Task | TaskProgram, num_envs: int = 1, **how: Any) -> CompiledEnv:
-    """Return a `MixedEnv` where the worlds of a split run under different rulesets, else a `CompiledEnv`.
+    """Return a `MixedEnv` if the worlds of a split run under different rulesets, else a `CompiledEnv`.
 
     Arguments and errors are those of `TensorEnv`.
     """
@@ -41,7 +41,7 @@ COLUMNS = (
     "episode_return",
     "episode_length",
 )
-"""The results of a step, a row for each episode: names of `Results`."""
+"""The results of a step, one row per episode: names of `Results`."""
 
 
 class Shown(Recycled):
@@ -54,7 +54,7 @@ class Shown(Recycled):
 
 
 class Joint:
-    """Steps the episodes of several steppers, one call each, into one memory.
+    """Steps the episodes of several steppers, one call each, into shared memory.
 
     Args:
         steppers: in order.
@@ -90,7 +90,7 @@ class Joint:
         if shown is None:
             shown = Shown(np.empty_like(self._observed))
             self._shown = [shown, *self._shown[:2]]
-        # Any other mode copies once more.
+        # Other modes make another copy.
         np.take(self._observed, self._order, 0, shown.observed, mode="clip")
         return [shown.observed, *(values[places] for values, places in self._places)]
 
@@ -106,12 +106,12 @@ def _places(memory: Array, parts: Sequence[Array]) -> Array:
 class MixedEnv(CompiledEnv):
     """A `TensorEnv` whose worlds run under different rulesets.
 
-    The number of an episode's world decides its ruleset (`TaskProgram.ruleset_of`). The episodes under one ruleset step
-    as a `CompiledEnv` of their own, and do what they would do alone. Its code is compiled when the first of them begins.
+    The number of an episode's world decides its ruleset (`TaskProgram.ruleset_of`). The episodes under one ruleset form
+    a `CompiledEnv`, with the results that they would have alone. Its code is compiled when the first of them begins.
 
     Raises:
-        ValueError: under one of the rulesets, observations or actions have another shape. It can come from `reset` and
-            `step`, where a ruleset is first needed.
+        ValueError: observations or actions have another shape under one of the rulesets. `reset` and `step` can raise
+            it too, when a ruleset is first needed.
     """
 
     takes_mixed = True
@@ -148,7 +148,7 @@ class MixedEnv(CompiledEnv):
     # Beginning
 
     def _restart(self, mask: Tensor, worlds: Tensor) -> None:
-        """Begin episodes where `mask`, bool [B], is set, in the worlds of those numbers, int64 [B]."""
+        """Begin episodes where `mask`, bool [B], is set, in the worlds with these numbers, int64 [B]."""
         rows = mask.nonzero()[:, 0].numpy()
         numbers = self.program.ruleset_of(worlds).numpy()
         for number in numbers[rows].tolist():
@@ -187,7 +187,7 @@ class MixedEnv(CompiledEnv):
         self._groups = groups
         members = np.concatenate([rows for _, rows in groups.values()])
         self._order = np.argsort(members)
-        self.episodes = episodes = MixedEpisodes([*groups.values()])  # type: ignore[assignment]  # reads like them
+        self.episodes = episodes = MixedEpisodes([*groups.values()])  # type: ignore[assignment]  # same attributes
         steppers = [env._ready() for env, _ in groups.values()]
         space, ready = self.observation.space, [stepper for stepper in steppers if stepper is not None]
         self._joint = None
@@ -277,7 +277,7 @@ class MixedEnv(CompiledEnv):
 
     @property
     def returns(self) -> Tensor:
-        """The return of each current episode so far: float64 [B]."""
+        """The return so far of each current episode: float64 [B]."""
         return joined(
             [env.returns for env, _ in self._groups.values()], [rows for _, rows in self._groups.values()]
         )

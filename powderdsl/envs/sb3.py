@@ -1,4 +1,4 @@
-"""`TensorEnv` as a vectorized environment of Stable-Baselines3's."""
+"""`TensorEnv` as a vectorized environment of Stable-Baselines3."""
 
 from __future__ import annotations
 
@@ -22,14 +22,13 @@ Array = NDArray[Any]
 class PowderVecEnv(Face, VecEnv):
     """Many worlds of a task, stepped together: ``PPO("CnnPolicy", PowderVecEnv("some-task", 32))``.
 
-    Infos are made for worlds whose episode ended, and empty for others: ``terminal_observation``,
-    ``TimeLimit.truncated``, ``is_success`` where the task says what success is, and ``episode`` as `Monitor` gives it,
-    which is therefore not needed.
+    Infos are empty except for worlds whose episode ended: ``terminal_observation``, ``TimeLimit.truncated``,
+    ``is_success`` if the task defines success, and ``episode`` as `Monitor` adds it, so that `Monitor` is not needed.
 
     Args:
         task, num_envs, and all others: those of `TensorEnv`, without `autoreset_mode`.
-        actions: as in `TensorEnv`, but numbers that nothing reads are left out by default.
-        render_mode: ``rgb_array`` or ``ansi``. render_scale: pixels along a cell's side.
+        actions: as in `TensorEnv`, but by default without unused numbers.
+        render_mode: ``rgb_array`` or ``ansi``. render_scale: pixels per side of a cell.
     """
 
     def __init__(self, task: str | Path | Task | TaskProgram, num_envs: int = 1, **how: Any):
@@ -39,10 +38,10 @@ class PowderVecEnv(Face, VecEnv):
         super().__init__(num_envs, self.tensors.observation.space, self.tensors.single_action_space)
 
     def reset(self) -> Array:
-        """Begin all episodes with the seeds and options that `seed` and `set_options` have left; they count once."""
+        """Begin all episodes, using the seeds and options set by `seed` and `set_options` once."""
         options = self._options[0]
         if any(other is not options and other != options for other in self._options):
-            raise ValueError("all worlds share one environment: they take the same options")
+            raise ValueError("all worlds share one environment, so they take the same options")
         observed, info = self.tensors.reset(seed=self._seeds, options=options)
         self._reset_seeds()
         self._reset_options()
@@ -50,7 +49,7 @@ class PowderVecEnv(Face, VecEnv):
         return array(observed)
 
     def step_async(self, actions: Any) -> None:
-        """Keep the actions, [B] or [B, k], for `step_wait`."""
+        """Store the actions, [B] or [B, k], for `step_wait`."""
         self._actions = actions
 
     def step_wait(self) -> tuple[Array, Array, Array, list[dict[str, Any]]]:
@@ -80,34 +79,34 @@ class PowderVecEnv(Face, VecEnv):
         return self.tensors.state()
 
     def restore(self, state: Mapping[str, Any]) -> Array:
-        """Continue from a state, as `TensorEnv.restore`; seeds and options that no reset has used are forgotten."""
+        """Continue from a state, as `TensorEnv.restore` does; discards seeds and options for the next reset."""
         observed = self.tensors.restore(state)
         self._reset_seeds()
         self._reset_options()
         return array(observed)
 
     def close(self) -> None:
-        """Nothing is left to close."""
+        """Do nothing: there is nothing to close."""
 
     def get_images(self) -> Sequence[Array | None]:
         """A picture of each world, uint8 [H, W, 3]."""
         return self.frames("rgb_array")
 
     def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
-        """An attribute, once a world: of this, or of its `TensorEnv`."""
+        """An attribute of this environment or its `TensorEnv`, once per world."""
         owner = self if hasattr(self, attr_name) else self.tensors
         return [getattr(owner, attr_name)] * len(self._chosen(indices))
 
     def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
-        """Set an attribute for all worlds. Raises ValueError for some of them: they share one environment."""
+        """Set an attribute for all worlds. Raises ValueError for a subset, since they share one environment."""
         if len(self._chosen(indices)) != self.num_envs:
-            raise ValueError("all worlds share one environment: an attribute is set for all of them")
+            raise ValueError("all worlds share one environment, so an attribute is set for all of them")
         setattr(self, attr_name, value)
 
     def env_method(
         self, method_name: str, *method_args: Any, indices: Any = None, **method_kwargs: Any
     ) -> list[Any]:
-        """Call a method once; the result for each world. Of `action_masks`, each world gets its own row."""
+        """Call a method once and return the result for each world; for `action_masks`, each world's own row."""
         if method_name == "action_masks":
             masks = self.action_masks()
             return [masks[place] for place in self._chosen(indices)]

@@ -1,4 +1,4 @@
-"""Batched episodes of a task that restart by themselves, and their observations: tensors on the simulator's device."""
+"""Batched episodes of a task, which restart automatically, and their observations, on the simulator's device."""
 
 from __future__ import annotations
 
@@ -32,12 +32,12 @@ OBSERVATIONS = ("ids", "compact", "matrix", "rgb", "laws")
 
 @dataclass(frozen=True)
 class Observation:
-    """One kind of observation of worlds of one ruleset and size. Channels come first, except in pictures.
+    """One form of observation of worlds of one ruleset and size. Channels come first, except in pictures.
 
-    ``ids``: uint8 [1, H, W], element ids. ``compact``: uint8 [C, H, W], everything that lasts from step to step, as
-    `Observer.compact` codes it. ``matrix``: float32 [C, H, W], as the ruleset's `matrix:` names its channels (the
-    paper's 20). ``rgb``: uint8 [H, W, 3]. ``laws``: uint8 [2, H, W], element ids, and then the `Laws` of the world: row by
-    row, and zeros behind them.
+    ``ids``: uint8 [1, H, W], element ids. ``compact``: uint8 [C, H, W], everything that persists between steps, as
+    encoded by `Observer.compact`. ``matrix``: float32 [C, H, W], the channels of the ruleset's `matrix:` (the paper's
+    20). ``rgb``: uint8 [H, W, 3]. ``laws``: uint8 [2, H, W], element ids, and the `Laws` of the world, row by row,
+    padded with zeros.
     """
 
     kind: str
@@ -48,7 +48,7 @@ class Observation:
     """The names of the channels."""
 
     def of(self, episodes: Episodes | MixedEpisodes) -> Tensor:
-        """The observations of a batch, in memory of their own: [B, *space.shape]."""
+        """The observations of a batch in new memory: [B, *space.shape]."""
         if isinstance(episodes, MixedEpisodes):
             return episodes.joined(lambda program, part: replace(self, laws=program.laws).of(part))
         world = episodes.world
@@ -75,7 +75,7 @@ def channels_of(kind: str, observer: Observer) -> tuple[str, ...]:
 
 
 def observation_of(kind: str, program: TaskProgram) -> Observation:
-    """The observation of a kind. Raises ValueError for an unknown kind, and for laws that are none, or too many."""
+    """The observation of a kind. Raises ValueError for an unknown kind, or if there are no laws or too many."""
     observer, ruleset, laws = program.simulator.observer, program.simulator.ruleset, program.laws
     channels, size = channels_of(kind, observer), program.task.size
     shape = (*size, 3) if kind == "rgb" else (len(channels), *size)
@@ -83,7 +83,7 @@ def observation_of(kind: str, program: TaskProgram) -> Observation:
         much = "are the same in all worlds" if not len(laws) else f"take {len(laws)} bytes, more than cells"
         raise ValueError(f"observation `laws`: the laws of {program.task.name} {much}")
     if kind != "matrix":
-        # Bytes, 0..255 whatever occurs: what Stable-Baselines3 takes for pictures, and stores as such.
+        # Always bytes in 0..255, which Stable-Baselines3 recognizes and stores as pictures.
         return Observation(kind, Box(0, 255, shape, np.uint8), laws, channels)
     bounds = [abs(bound) for slot in observer.slots.values() for bound in (slot.kind.lo, slot.kind.hi)]
     bounds += [max(map(abs, property_values(ruleset, prop.name))) for prop in ruleset.properties]
@@ -96,10 +96,10 @@ Info = dict[str, Any]
 
 OPTIONS = ("params", "worlds", "reset_mask")
 ROWS = ("base", "episode", "returned", "ended")
-"""Attributes, with `_` before them, that `TensorEnv.state` saves: one number for each environment."""
+"""Attributes (without `_`) that `TensorEnv.state` saves: one number per environment."""
 
 MAX_SEED = (1 << 62) - 1
-"""The largest seed, and number of a world."""
+"""The largest seed and world number."""
 
 LAST_ACTIONS = ("auto", "truncates", "terminates")
 
@@ -107,8 +107,8 @@ LAST_ACTIONS = ("auto", "truncates", "terminates")
 def world_seeds(base: Tensor, episode: Tensor, worlds: int) -> Tensor:
     """The number of the world that each environment plays: int64 [B].
 
-    Episode 0 of an environment whose seed is `base` plays world `base`. Later ones play worlds below `worlds`, drawn by
-    a hash of `base` and `episode` (both int64 [B]), so that environments do not depend on one another.
+    Episode 0 of an environment with seed `base` plays world `base`. Later episodes play worlds below `worlds`, chosen
+    by a hash of `base` and `episode` (both int64 [B]), so that environments are independent of one another.
     """
     key = mix(mix(base & MASK) ^ ((base >> 32) & MASK))
     high, low = mix((key + episode) & MASK), mix((key ^ mix(episode & MASK)) & MASK)
@@ -117,37 +117,37 @@ def world_seeds(base: Tensor, episode: Tensor, worlds: int) -> Tensor:
 
 
 class TensorEnv:
-    """`num_envs` episodes of a task at once. Returned tensors are never written to later.
+    """`num_envs` episodes of a task at once. Returned tensors are never overwritten.
 
     Args:
         task: name of a shipped task, path of a task file, a `Task`, or a `TaskProgram`, which several environments can
-            share and which already has its split, knobs, parameters, backend and device.
+            share and which fixes the split, knobs, parameters, backend and device.
         num_envs: the number of environments, B.
         split: the set of worlds: ``train``, ``test``, or another split of the task.
         observation: the form of observations: ``ids``, ``compact``, ``matrix``, ``rgb`` or ``laws``
                 (docs/environments.md).
         knobs: values for the task's knobs, by name.
         params: values for parameters of the task's rules, by qualified name; `reset` may override them.
-        worlds: later episodes draw from the worlds 0 … worlds − 1 of the split.
+        worlds: later episodes use worlds 0 … worlds − 1 of the split.
         autoreset_mode: what happens after an episode's last step, as Gymnasium defines it: ``SAME_STEP`` returns the
             next episode's first observation, and the last one in the infos; ``NEXT_STEP`` starts it with the following
             call, whose action is ignored; ``DISABLED`` leaves it to `reset`.
-        last_action: whether the last action ``truncates`` or ``terminates`` an episode. ``auto``: it terminates if the task
-            has a `final` reward, which has then been given, and truncates if rewards would continue.
-        max_episode_steps: truncates earlier than the task does.
+        last_action: whether the last action ``truncates`` or ``terminates`` an episode. ``auto``: it terminates if the
+            task has a `final` reward, and truncates otherwise, since rewards would continue.
+        max_episode_steps: truncate episodes earlier than the task does.
         actions: the form of actions: ``multidiscrete``, ``discrete`` or ``full`` (docs/environments.md).
-        action_mask: adds ``action_mask``, int8 [B, n], to infos: see `action_masks`.
+        action_mask: add ``action_mask``, int8 [B, n], to infos: see `action_masks`.
         backend: as in `powderdsl.compile`.
         device: as in `powderdsl.compile`.
         threads: as in `powderdsl.compile`.
-        curriculum: chooses the worlds of later episodes instead.
+        curriculum: chooses the worlds of later episodes instead of a hash.
 
     Attributes:
         num_envs: the number of environments, B.
         single_action_space: the Gymnasium space of the actions of one environment.
         action_nvec: the number of values of each number of an action.
         device: the torch device of all tensors.
-        takes_mixed: whether worlds may run under different rulesets.
+        takes_mixed: true if worlds may run under different rulesets.
 
     Raises:
         CompileError: an unknown task, split, knob or parameter.
@@ -199,9 +199,9 @@ class TensorEnv:
         self.last_action_terminates = ends[last_action]
         self.max_episode_steps = min(self.task.agent.actions, max_episode_steps or self.task.agent.actions)
         self.episodes: Episodes | None = None
-        """The current worlds, to read; the next call writes to their tensors."""
+        """The current worlds, read-only; the next call overwrites their tensors."""
         self.params: dict[str, Tensor] = {}
-        """Parameters that `reset` has set: float64 [B] each."""
+        """Parameters set by `reset`: float64 [B] each."""
         self._base: Tensor | None = None
         self._episode = torch.full((num_envs,), -1, dtype=torch.int64, device=self.device)
         self._returned = torch.zeros(num_envs, dtype=torch.float64, device=self.device)
@@ -215,18 +215,18 @@ class TensorEnv:
         """Begin all episodes, or those of a mask.
 
         Args:
-            seed: s gives environment i the seed s + i; a list gives each its own, or None. A seed decides the worlds of
-                this and all later episodes: see `world_seeds`. Without a seed, an environment continues with its next
-                episode.
-            options: ``params``: parameters of the rules from now on, a number each or [B]; they stay until others are
-                given, and ``{}`` restores the defaults. ``worlds``: numbers of the worlds to play in these episodes, a
-                number or [B]. ``reset_mask``: bool [B]: only these environments are reset.
+            seed: an integer s gives environment i the seed s + i; a list has a seed or None for each. A seed determines
+                the worlds of this and all later episodes: see `world_seeds`. Without a seed, an environment continues
+                with its next episode.
+            options: ``params``: parameters of the rules, each a number or [B]; they stay in effect until replaced, and
+                ``{}`` restores the defaults. ``worlds``: numbers of the worlds of these episodes, a number or [B].
+                ``reset_mask``: bool [B], the environments to reset.
 
         Returns:
             Observations [B, …], and the infos of `step` without those of ended episodes.
 
         Raises:
-            TypeError: a seed or an option has the wrong type. Nothing has changed then, nor in the other cases.
+            TypeError: a seed or an option has the wrong type. After an error, nothing has changed.
             ValueError: a seed or an option is out of range, or has the wrong shape.
             KeyError: there is no such option or parameter.
         """
@@ -260,15 +260,15 @@ class TensorEnv:
             self.episodes = self.program.restart(self.episodes, mask, worlds, reuse=True)
 
     def _choose(self, base: Tensor, episode: Tensor) -> Tensor:
-        """The worlds of environments' episodes, int64 [n]: those of `world_seeds`, unless a curriculum has others."""
+        """The worlds of environments' episodes, int64 [n]: chosen by `world_seeds` or a curriculum."""
         worlds = world_seeds(base, episode, self.worlds)
         return worlds if self.curriculum is None else self.curriculum.choose(base, episode, worlds)
 
     def adopt(self, episodes: Episodes, returned: Tensor, params: Mapping[str, Tensor]) -> None:
-        """Continue with other episodes, none of which is over; their number may differ.
+        """Continue with other, unfinished episodes; their number may differ.
 
         Args:
-            returned: their returns so far, float64 [B].
+            returned: the returns so far, float64 [B].
             params: parameters as `params` has them, [B] each.
         """
         self.num_envs, self.episodes, self.params = len(episodes), episodes, dict(params)
@@ -283,7 +283,7 @@ class TensorEnv:
         info["_episode_return"] = info["_episode_length"] = ended.clone()
 
     def _add_shown(self, info: Info, mask: Tensor) -> None:
-        """Add the numbers of the shown worlds and their action masks, valid where `mask`, bool [B], is set."""
+        """Add the numbers of the worlds shown and their action masks, valid where `mask`, bool [B], is set."""
         assert self.episodes is not None
         info["world"], info["_world"] = self.episodes.seed.clone(), mask.clone()
         if self.shows_mask:
@@ -316,7 +316,7 @@ class TensorEnv:
         names = changes.keys() if bool(mask.all()) else {**changes, **self.params}.keys()
         drawn = {part.name for part in self.task.split(self.split).params}
         for name in drawn - {*changes}:
-            whole[name] = torch.full_like(whole[name], torch.nan)  # each world keeps what it draws
+            whole[name] = torch.full_like(whole[name], torch.nan)  # each world keeps its draws
         old = {
             **self.simulator.parameters({}, self.num_envs),
             **dict.fromkeys(drawn, torch.tensor(torch.nan)),
@@ -327,7 +327,7 @@ class TensorEnv:
     # Saving
 
     def state(self) -> dict[str, Any]:
-        """Return everything that later steps depend on, as dicts of tensors on the CPU.
+        """Return everything that later steps depend on, as dicts of CPU tensors.
 
         Raises:
             ResetNeeded: before the first reset.
@@ -363,11 +363,11 @@ class TensorEnv:
     # Stepping
 
     def step(self, actions: Any) -> tuple[Tensor, Tensor, Tensor, Tensor, Info]:
-        """Act once in every episode.
+        """Take one action in every episode.
 
         Args:
-            actions: integers [B, k], or [B] if they are discrete, each from 0 to ``action_nvec − 1``. The numbers of
-                ``full`` actions are x, y, choice, vx, vy.
+            actions: integers [B, k], or [B] for discrete actions, each from 0 to ``action_nvec − 1``. ``full`` actions
+                are x, y, choice, vx, vy.
 
         Returns:
             Observations [B, …]; reward float32 [B]; terminated and truncated, bool [B]; and infos, which have the same
@@ -415,9 +415,9 @@ class TensorEnv:
         return observed, reward, terminated, truncated, info
 
     def _begin(self, mask: Tensor, observed: Tensor, info: Info | None = None) -> None:
-        """Begin the next episodes where `mask`, bool [B], is set: their first observations go into `observed`.
+        """Begin the next episodes where `mask`, bool [B], is set, and write their first observations to `observed`.
 
-        With `info` the last observations, and what has been said of their episodes, go there.
+        With `info`, add the last observations and the infos of the ended episodes.
         """
         assert self.episodes is not None
         assert self._base is not None
@@ -439,7 +439,7 @@ class TensorEnv:
 
 
 def seeds_of(seed: Any, count: int) -> list[int | None]:
-    """The seeds of environments: s gives environment i the seed s + i; a list gives each its own, or None.
+    """The seeds of environments: an integer s gives environment i the seed s + i; a list has a seed or None for each.
 
     Raises TypeError or ValueError if it is neither, or has another length, or a seed is out of range.
     """
@@ -460,7 +460,7 @@ def seeds_of(seed: Any, count: int) -> list[int | None]:
 
 
 def check_options(options: Mapping[str, Any], known: Sequence[str]) -> None:
-    """Raises KeyError for an option of `reset` that does not exist."""
+    """Raise KeyError for an unknown option of `reset`."""
     if unknown := sorted(options.keys() - {*known}):
         raise KeyError(f"no option `{unknown[0]}`: there are {', '.join(known)}")
 
@@ -479,19 +479,19 @@ def reset_mask(value: Any, count: int, begun: bool, device: torch.device) -> Ten
 
 
 def check_going(waiting: Tensor) -> None:
-    """Raises ResetNeeded where episodes, bool [B], are over."""
+    """Raise ResetNeeded if any episode, bool [B], is over."""
     if bool(waiting.any()):
         over = waiting.nonzero()[:8, 0].tolist()
         raise ResetNeeded(f"the episodes of environments {over} are over: reset them with a reset_mask")
 
 
 def check_cells(num_envs: int, size: tuple[int, int]) -> None:
-    """Raises ValueError for no worlds, or more than a simulator takes."""
+    """Raise ValueError for zero worlds, or more than a simulator supports."""
     check_count("num_envs", num_envs, MAX_CELLS // (size[0] * size[1]))
 
 
 def mode_of(value: AutoresetMode | str) -> AutoresetMode:
-    """A mode of Gymnasium's, or the one of a name, which may be written in any case."""
+    """A Gymnasium mode, given as such or by its case-insensitive name."""
     if isinstance(value, AutoresetMode):
         return value
     check_choice("autoreset_mode", value.upper(), [mode.name for mode in AutoresetMode])

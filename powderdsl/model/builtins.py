@@ -1,4 +1,4 @@
-"""The table of words that every rule file knows: directions, kernels, kinds; functions are rows of `operations`. Docs are made from it."""
+"""Built-in words of rule files: directions, kernels, kinds. Functions are rows of `operations`."""
 
 from __future__ import annotations
 
@@ -61,10 +61,10 @@ def shaped_kernel(shape: str, radius: int, name: str = "", wrap: bool = False) -
 
 
 KERNELS: dict[str, Kernel] = {name: shaped_kernel(name, 1, name) for name in ("box", "ring", "cross", "plus")}
-"""Neighborhoods for `count` and `sum`. Cells outside the grid count as nothing."""
+"""Neighborhoods for `count` and `sum`. Cells outside the grid do not count."""
 
 COORDINATES = ("row", "column", "step")
-"""Where and when: integers that are used with `mod`, as in `(row + step) mod 2`."""
+"""Coordinates in space and time, which are used with `mod`, as in `(row + step) mod 2`."""
 
 KIND_WORDS: dict[str, str] = {
     "flag": "yes or no",
@@ -77,38 +77,38 @@ KIND_WORDS: dict[str, str] = {
 """Kinds of properties, fields and parameters, besides ranges of integers, LOW..HIGH."""
 
 FLAG_WORDS = {"yes": 1, "true": 1, "no": 0, "false": 0}
-"""How flags are written outside rules: in drawn fields, and for parameters."""
+"""Flags outside rules: in drawn fields, and for parameters."""
 
 MAX_OFFSET = 15
-"""How far a rule may look in one step."""
+"""Maximum offset of a rule."""
 
 MAX_SIDE_MULTIPLE = 64
-"""The largest number that a pack may ask the sides of worlds to be multiples of."""
+"""The largest `side_multiple`."""
 
 MAX_MAGNITUDE = 1_000_000
 """The largest number a rule file may contain."""
 
 RESERVED = frozenset((*DIRECTIONS, *DIRECTION_SETS, *KERNELS, *FUNCTIONS, *COORDINATES))
-"""Words that no definition may take. Shapes such as `diamond(3)` have their radius with them: elements may have their names."""
+"""Words that definitions cannot use. Shapes, such as `diamond(3)`, need a radius, so elements may have their names."""
 
 ELSEWHERE = {
     **dict.fromkeys(("up", "north", "top"), "write `above`"),
     **dict.fromkeys(("down", "south", "bottom"), "write `below`"),
     "west": "write `left`",
     "east": "write `right`",
-    **dict.fromkeys(("self", "this"), "a rule speaks of its own cell already: leave it out, or write `here`"),
+    **dict.fromkeys(("self", "this"), "a rule applies to its own cell anyway: omit it, or write `here`"),
     "true": "write `yes`",
     "false": "write `no`",
-    **dict.fromkeys(("none", "nothing", "air"), "name the element that stands for nothing, such as `empty`"),
+    **dict.fromkeys(("none", "nothing", "air"), "name the element that represents nothing, such as `empty`"),
     **dict.fromkeys(("neighbors", "neighbours"), "count them: `count(SET)`, `count(SET in ring)`"),
     **dict.fromkeys(
-        ("random", "rand"), "say `with chance 5%` at the end of the rule, or compare a stream: `luck < 5%`"
+        ("random", "rand"), "write `with chance 5%` at the end of the rule, or compare a stream: `luck < 5%`"
     ),
-    "probability": "say `with chance 5%` at the end of the rule",
+    "probability": "write `with chance 5%` at the end of the rule",
     **dict.fromkeys(("floor", "round", "int"), "`a div b` divides integers and rounds down"),
     "ceil": "`a div b` divides integers and rounds down: `(a + b - 1) div b` rounds up",
     "sqrt": "there are no roots; `length(VEC2)` is the length of a vector",
-    "pow": "powers are written out: `x * x`",
-    "distance": "`count(SET in disc(3)) > 0` asks what is near; `length(VEC2)` is the length of a vector",
+    "pow": "there is no power operator: write `x * x`",
+    "distance": "`count(SET in disc(3)) > 0` tests what is near; `length(VEC2)` is the length of a vector",
 }
 """Words of other languages, and what to write instead."""

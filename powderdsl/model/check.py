@@ -1,4 +1,4 @@
-"""Declarations -> checked model. One straight function; each step reports all it can.
+"""Declarations -> checked model, in one straight function. Each step reports as much as it can.
 
 Some packs of a composition are also checked alone, as their authors knew them, without added packs.
 """
@@ -69,7 +69,7 @@ OF_COMPOSITIONS = ("PD315", "PD316")
 """Warnings about a combination of packs: misspelled optional names, and values that another pack replaces."""
 
 MISREAD = ("PD109", "PD302", "PD303", "PD305", "PD306", "PD307", "PD310", "PD311", "PD508")
-"""Errors after which rules would only be misread: names that clash, packs and elements that are missing."""
+"""Errors after which rules would be misread: names that clash, packs and elements that are missing."""
 
 
 def resolve_names(
@@ -101,13 +101,13 @@ def check(
     Args:
         palette: ids that were recorded earlier, see `model/composition/compose.py`.
         elsewhere: words that packs define which are not loaded, with the pack.
-        alone: no pack counts as added to others: rules that meet are errors.
+        alone: treat no pack as added to others, so that conflicts are errors.
     """
     typer, element_values = resolve_names(packs, ruleset, reporter, palette)
     composition = typer.symbols
     elaborated = Elaborator(typer)
     elaborated.run(composition.passes)
-    report_undeclared_needs(typer)  # tests and invariants only speak of what is loaded
+    report_undeclared_needs(typer)  # tests and invariants only concern what is loaded
     examples = check_examples(typer)
     check_alone = partial(_check_some, Declared(tuple(packs), None), alone=True)
     invariants = check_invariants(composition, typer, check_alone)
@@ -240,7 +240,7 @@ def demote_outgrown(ruleset: Ruleset, remarks: tuple[Diagnostic, ...]) -> tuple[
 
 
 def _known_words(author: PackDecl | RulesetDecl) -> list[str]:
-    """The words that a pack's rules and elements, or a ruleset's invariants, use: they show which packs it knows."""
+    """The words that a pack's rules and elements, or a ruleset's invariants, use, which show what packs it knows."""
     if isinstance(author, RulesetDecl):
         return [word for line in author.invariants for word in words_of(line)]
     words = [*pack_words(author), *(also.name.word for also in author.also)]
@@ -252,7 +252,7 @@ def _known_words(author: PackDecl | RulesetDecl) -> list[str]:
 # Invariants: statements about all worlds, read as words and checked like conditions
 
 MAX_STEPS = 1000
-"""Steps in a row that `never … for N steps` may ask for: each test runs them all."""
+"""Maximum N of `never … for N steps`: each test runs all of them."""
 
 MAX_RADIUS = 1000
 
@@ -299,7 +299,7 @@ def check_invariants(
 
 
 def _claim(typer: Typer, line: Syntax, pack: str) -> tuple[Claim, frozenset[int]]:
-    """The claim of a line, and the elements that start worlds must not hold. Raises Poisoned or Unresolved."""
+    """The claim of a line, and the elements that start worlds must not contain. Raises Poisoned or Unresolved."""
     typer.absent.clear()
     typer.start_rule(line.span)
     scope, without = Scope(pack, {}), frozenset[int]()
@@ -307,7 +307,7 @@ def _claim(typer: Typer, line: Syntax, pack: str) -> tuple[Claim, frozenset[int]
         line, what = line.children
         without = frozenset(typer.set_of(typer.evaluate(what, scope), what.span).ids)
         if without == typer.symbols.names_by_id.keys():
-            label = "no world is without all of these"
+            label = "every world has some of these"
             raise typer.fail("PD511", "this invariant cannot hold", what.span, label)
         typer.absent.clear()  # a world is without elements of packs that are not loaded
     return _Statement(typer, scope).claim(line), without
@@ -336,7 +336,7 @@ class _Statement:
                     return self.total(parts[0], TRENDS[parts[1].text])
                 ids = typer.set_of(typer.evaluate(parts[0], scope), parts[0].span).ids
                 if not ids:
-                    self.report_trivial(parts[0].span, "no element is meant", is_empty=True)
+                    self.report_trivial(parts[0].span, "no element matches", is_empty=True)
                 return Unchanging(frozenset(ids))
             case "total":  # `count(…) is constant`, `sum(…) is constant`
                 (what,) = parts
@@ -353,7 +353,7 @@ class _Statement:
                 if condition == TRUE:
                     raise typer.fail(
                         "PD511", "this invariant cannot hold", parts[0].span, "every cell fulfills this",
-                        "say what no cell may fulfill")  # fmt: skip
+                        "write a condition that no cell may meet")  # fmt: skip
                 return Never(self.check_open(condition, parts[0].span), steps)
             case "reach":  # `nothing reaches beyond N cells`
                 self.check_words(parts, ("nothing",), ("reaches",), ("beyond",), ("cells", "cell"))
@@ -406,7 +406,7 @@ class _Statement:
         numbers = kind_name(operand) in ("int", "real", "vec2")
         if not isinstance(operand, Expr) or operand.op not in ("field", "property") or not numbers:
             raise typer.wrong(
-                operand, "a field of numbers", what.span, "for anything else say `never CONDITION`"
+                operand, "a field of numbers", what.span, "for anything else write `never CONDITION`"
             )
         lo, hi = read_bounds(bounds, typer)
         name, kind = str(operand.value), operand.kind
@@ -438,7 +438,7 @@ class _Statement:
         self.typer.reporter.report("PD510", message, span, label, helps=["remove it"])
 
     def check_words(self, words: tuple[Syntax, ...], *wanted: tuple[str, ...]) -> None:
-        """Report the first word that is not one of the words wanted in its position."""
+        """Report the first word that is not allowed in its position."""
         for word, options in zip(words, wanted, strict=True):
             if word.text not in options:
                 listed = " or ".join(f"`{option}`" for option in options)

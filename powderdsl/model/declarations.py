@@ -1,6 +1,6 @@
-"""Declarations of rule files: shapes and literals are checked, names are not resolved.
+"""Declarations of rule files, with shapes and literals checked but names not yet resolved.
 
-The fields of these records are the keys that rule files may have: messages and the docs list them from here.
+The fields of these records are the keys of rule files, from which messages and the docs list them.
 """
 
 from __future__ import annotations
@@ -45,11 +45,11 @@ class Definition(Entry):
     pack: str = ""
     """The pack or ruleset of the file."""
     values: tuple[Pair, ...] = ()
-    """Values of single elements: of this one, by property or field, or of this property or field, by element."""
+    """Values of single elements: for an element, by property or field; for a property or field, by element."""
 
     @property
     def qualified(self) -> str:
-        """The name that does not depend on the other loaded packs."""
+        """The name, which does not depend on the other loaded packs."""
         return f"{self.pack}.{self.name.text}"
 
     @property
@@ -63,7 +63,7 @@ class TagDecl(Definition, noun="a tag"):
 
 class PropertyDecl(Definition, noun="a property", others="an element"):
     type: Syntax | None = keyed("its kind", required=True, short=True)
-    default: Syntax | None = keyed("the value for all other elements")
+    default: Syntax | None = keyed("its value for all other elements")
     about: str = keyed("a one-sentence description", "")
 
 
@@ -125,7 +125,7 @@ class ElementDecl(Definition, noun="an element", others="a property or field"):
 
     @property
     def number(self) -> int | None:
-        """The id that it asks for."""
+        """The requested id."""
         return int(self.id.text) if self.id else None
 
 
@@ -183,14 +183,14 @@ class Block(Record, noun="a block", prefixes=("for ", "repeat ")):
     )
 
     def walk(self) -> Iterator[Block]:
-        """This block and all blocks in it, as they are written."""
+        """This block and all nested blocks, in order."""
         yield self
         for block in (*self.blocks, *self.then):
             yield from block.walk()
 
     @property
     def lines(self) -> tuple[Syntax, ...]:
-        """The lines of this block alone: its values, its loop, its rules."""
+        """The lines of this block: its values, its loop and its rules."""
         return (*(value for _, value in self.lets), *([self.header] if self.header else []), *self.rules)
 
 
@@ -237,7 +237,7 @@ class PackDecl(Record, noun="a pack"):
     source: Source
     about: str = keyed("a description; most entries can have one", "")
     needs: Words = keyed("packs to load with this one", ())
-    provides: Words = keyed("packs that it can replace where others need them", ())
+    provides: Words = keyed("packs whose place it can take when other packs need them", ())
     conflicts: Words = keyed("packs that must not be loaded with this one", ())
     tags: tuple[TagDecl, ...] = keyed("tags and their descriptions", ())
     properties: tuple[PropertyDecl, ...] = keyed("numbers that every element has", ())
@@ -264,9 +264,9 @@ class PackDecl(Record, noun="a pack"):
 
 
 class RulesetDecl(Record, noun="a ruleset"):
-    """One ruleset file. `packs`, `slots`, `matrix`, `params` and `rename` are as written, without what it inherits.
+    """One ruleset file. `packs`, `slots`, `matrix`, `params` and `rename` are as written, without inherited values.
 
-    `base` is the ruleset that it extends; `beside` are rulesets that were named before it, of which it is not a part.
+    `base` is the ruleset that it extends; `beside` are unrelated rulesets named before it.
     """
 
     name: Scalar = keyed("the ruleset's name", MISSING, name="ruleset")
@@ -280,18 +280,18 @@ class RulesetDecl(Record, noun="a ruleset"):
     rename: tuple[tuple[Scalar, Scalar], ...] = keyed(
         "other names for definitions: `pack.word: name`", (), maps="qualified names to names"
     )
-    """Qualified names, and the names by which these definitions are known here."""
-    params: tuple[Pair, ...] = keyed("other values of parameters", (), maps="parameters to values")
+    """Qualified names, and the new names of these definitions."""
+    params: tuple[Pair, ...] = keyed("values of parameters", (), maps="parameters to values")
     also: tuple[AlsoDecl, ...] = keyed("tags, values and colors for elements of its packs", ())
     invariants: tuple[Syntax, ...] = keyed("statements that hold in every world", (), shape="invariants")
     left_out: Mapping[str, PackDecl] = field(default_factory=dict)
-    """Packs of its own that are not loaded: the ids of their elements stay reserved."""
+    """Its packs that are not loaded; the ids of their elements stay reserved."""
     base: RulesetDecl | None = None
     beside: tuple[RulesetDecl, ...] = ()
 
     @property
     def members(self) -> dict[str, RulesetDecl]:
-        """The ruleset's packs: those of its base that it keeps, then its own; each with the ruleset in whose file it is listed."""
+        """The ruleset's packs, first those kept from its base, each with the ruleset that lists it."""
         members = self.base.members if self.base else {}
         for scalar in self.without:
             members.pop(scalar.text, None)
@@ -301,7 +301,7 @@ class RulesetDecl(Record, noun="a ruleset"):
 
     @property
     def lineage(self) -> tuple[RulesetDecl, ...]:
-        """This ruleset, all that it extends and all beside it, each once, bases first."""
+        """This ruleset, those that it extends and those beside it, each once, bases first."""
         lineage: dict[str, RulesetDecl] = {}
         for start in filter(None, (*self.beside, self.base)):
             for ruleset in start.lineage:
@@ -311,12 +311,12 @@ class RulesetDecl(Record, noun="a ruleset"):
 
     @property
     def layout_ruleset(self) -> RulesetDecl:
-        """The ruleset whose packs come first in ids and channels: the last that says `slots` or `matrix`."""
+        """The ruleset whose packs come first in ids and channels: the last one with `slots` or `matrix`."""
         return self if self.slots or self.matrix or self.base is None else self.base.layout_ruleset
 
     @property
     def leading_packs(self) -> list[str]:
-        """The packs of `layout_ruleset`, except packs that others of the same name replace."""
+        """The packs of `layout_ruleset`, except those replaced by others of the same name."""
         members, leading = self.members, self.layout_ruleset.members
         return [name for name, ruleset in leading.items() if members.get(name, ruleset) is ruleset]
 
@@ -339,7 +339,7 @@ WEIGHT = re.compile("-?[0-9]{1,3}")
 
 
 def read_file(source: Source, reporter: Reporter) -> PackDecl | RulesetDecl | None:
-    """Parse and shape-check a rule file. Reports everything it can; None if the file is unusable."""
+    """Parse and shape-check a rule file, reporting as much as possible; None if the file is unusable."""
     tree = read_tree(source, reporter, "a pack starts with `pack: NAME`")
     if tree is None:
         return None
@@ -356,14 +356,14 @@ def read_file(source: Source, reporter: Reporter) -> PackDecl | RulesetDecl | No
         drawn = key.text in ("scene", "scenes")
         reporter.error(
             "PD109", "a file without `pack` or `ruleset`", key.span, "this is a drawn world" if drawn else "not a rule file",
-            helps=["name it as a world, not among the rules" if drawn else "a pack starts with `pack: NAME`"],
+            helps=["use it as a world, not as rules" if drawn else "a pack starts with `pack: NAME`"],
         )  # fmt: skip
         return None
     return reader.file(PackDecl, tree)
 
 
 class _PackReader(Reader):
-    """Reads the records of rule files. Its methods check what the declarations of keys cannot."""
+    """Reads the records of rule files. Its methods check what the declarations of keys cannot express."""
 
     owner = ""
     """The pack or ruleset whose file this is."""
@@ -375,7 +375,7 @@ class _PackReader(Reader):
         return record if record is not None and self.name(record.name, kind.NOUN) else None  # type: ignore[attr-defined]  # files have names
 
     def ruleset(self, tree: YamlMapping) -> RulesetDecl | None:
-        """Read a ruleset, and report what it lacks; None if its name cannot be read."""
+        """Read a ruleset, and report missing parts; None if its name is unreadable."""
         ruleset = self.file(RulesetDecl, tree)
         if tree.get("extends") is not None:
             return ruleset
@@ -388,8 +388,8 @@ class _PackReader(Reader):
         if ruleset is not None and ruleset.without:
             first = ruleset.without[0]
             self.reporter.error(
-                "PD304", f"`{first.text}` is left out of nothing", first.span, "this ruleset extends none",
-                helps=["remove `without`, or say which ruleset this one `extends`"],
+                "PD304", f"`{first.text}` is left out of nothing", first.span, "this ruleset does not extend another",
+                helps=["remove `without`, or add `extends`"],
             )  # fmt: skip
         return ruleset
 
@@ -447,7 +447,7 @@ class _PackReader(Reader):
         return KernelDecl(name=key, **values) if values.get("rows") or "shape" in values else None
 
     def kernel_rows(self, key: Scalar, node: Node, words: tuple[Scalar, ...]) -> tuple[tuple[int, ...], ...]:
-        """Rows of weights with a cell in the middle; none after reporting what they lack."""
+        """Rows of weights with a cell in the middle; none after a report."""
         rows = [word.text.split() for word in words]
         wrong = [
             word.span
@@ -460,7 +460,7 @@ class _PackReader(Reader):
             self.reporter.error(
                 "PD110", f"the kernel `{key.text}` is not made of rows of weights", [*wrong, key.span][0],
                 f"{len(rows)} rows, the first of {len(rows[0])} weights",
-                helps=[f"write rows of integers, equally many in each: an odd number of both, at most {SIDES[-1]}"],
+                helps=[f"write rows of equal length, an odd number of rows and of integers in each, at most {SIDES[-1]}"],
             )  # fmt: skip
         else:
             return tuple(tuple(map(int, row)) for row in rows)
@@ -476,7 +476,7 @@ class _PackReader(Reader):
             self.reporter.error(
                 "PD107", "a block with two actions", actions[1][0].span, "the second one",
                 secondary=[Label(actions[0][0].span, "the first one")],
-                helps=["put what comes next under `then:`"],
+                helps=["put the next action under `then:`"],
             )  # fmt: skip
         if actions:
             key, body = actions[0]
@@ -497,18 +497,16 @@ class _PackReader(Reader):
         """A rule or a list of rules (one substep), or a block or a list of blocks (one after the other)."""
         items = node.items
         if not items or (isinstance(node, Scalar) and not node.text):
-            helps = ["write rules, or leave the key out"]
-            self.reporter.error(
-                "PD109", "a place for rules without any", node.span, "nothing here", helps=helps
-            )
+            helps = ["write rules, or omit the key"]
+            self.reporter.error("PD109", "no rules here", node.span, "nothing here", helps=helps)
             return (), ()
         is_block = isinstance(items[0], YamlMapping)
         other = next((item for item in items if isinstance(item, YamlMapping) != is_block), None)
         if other is not None:
             self.reporter.error(
-                "PD204", "rules and blocks in one list", first_line(other), "not of the kind of the first item",
-                notes=["a list of rules is one substep; a list of blocks happens one after the other"],
-                helps=["put each group of rules under a `- do:` of its own; quote a rule that has `: ` in it"],
+                "PD204", "rules and blocks in one list", first_line(other), "not like the first item",
+                notes=["a list of rules is one substep; blocks of a list run one after another"],
+                helps=["put each group of rules under its own `- do:`; quote a rule that contains `: `"],
             )  # fmt: skip
             return (), ()
         if is_block:
@@ -540,6 +538,6 @@ class _PackReader(Reader):
                     yield change, chance
                     continue
                 self.reporter.error(
-                    "PD110", "`often` says what becomes of cells", key.span, "not of the form `A -> B`",
-                    helps=["write what holds in a cell before and after: `egg -> hen: 2%`"],
+                    "PD110", "`often` lists changes of cells", key.span, "not of the form `A -> B`",
+                    helps=["write the state of a cell before and after: `egg -> hen: 2%`"],
                 )  # fmt: skip

@@ -36,18 +36,18 @@ from powderdsl.model.types import (
 from powderdsl.syntax.parse import Syntax
 
 ORDERED = ("int", "flag", "real")
-"""Kinds of fields that a color can follow: their values have an order."""
+"""Kinds of fields that a color can follow, whose values are ordered."""
 
 KINDS = {
     "parameter": (("chance", "int", "real", "flag"), "kinds: chance, LOW..HIGH, real(LOW..HIGH), flag"),
     "property": (("int", "flag", "chance"), "kinds of properties: LOW..HIGH, flag, chance"),
     "field": (("int", "flag", "real", "vec2", "element", "direction"), "use `real(0..1)`"),
 }
-"""The kinds that each may have, and the fix for another kind."""
+"""The kinds that each may have, and the fix for any other kind."""
 
 
 def define_symbols(typer: Typer) -> list[tuple[str, int, Span]]:
-    """Complete a typer's symbols, whose names are known. Reports wrong definitions and leaves them out.
+    """Complete the symbols of a typer that knows their names. Reports wrong definitions and leaves them out.
 
     Returns the elements' own values of properties: property, id, span.
     """
@@ -59,9 +59,9 @@ def define_symbols(typer: Typer) -> list[tuple[str, int, Span]]:
     for name, param in symbols.param_decls.items():
         word = names.of(param.pack, param.name.text)
         if word in names.versions and names.knows(param.pack, word):
-            # A rule would read the other one without a sign.
+            # A rule would silently read the other one.
             typer.reporter.error(
-                "PD308", f"the parameter `{word}` hides another `{word}`", param.span, "the same word",
+                "PD308", f"the parameter `{word}` hides another `{word}`", param.span, "the same name",
                 secondary=[Label(names.versions[word][-1].span, "this one")], helps=["rename the parameter"],
             )  # fmt: skip
         with suppress(Poisoned):
@@ -128,7 +128,7 @@ def _shaped_kernel(name: str, decl: KernelDecl, shape: Syntax, typer: Typer) -> 
 
 
 def _kind(noun: str, decl: TypedDecl, typer: Typer) -> Kind:
-    """The kind of a definition. Raises Poisoned after reporting one that it may not have."""
+    """The kind of a definition. Raises Poisoned after reporting one that is not allowed."""
     if decl.type is not None:
         kind = read_kind(decl.type, typer)
         allowed, fix = KINDS[noun]
@@ -138,7 +138,7 @@ def _kind(noun: str, decl: TypedDecl, typer: Typer) -> Kind:
     default = decl.default
     if noun != "parameter" or default is None:
         raise Poisoned
-    # `rate: 2%` is a chance, `wet: yes` a flag; other numbers must say their range.
+    # `rate: 2%` is a chance, `wet: yes` a flag; other numbers must declare a range.
     if default.kind == "percent":
         return CHANCE
     if default.kind in ("yes", "no"):
@@ -146,7 +146,7 @@ def _kind(noun: str, decl: TypedDecl, typer: Typer) -> Kind:
     name, value = decl.name.text, default.span.text
     bounds = "real(0..1)" if "." in value else "0..9"
     raise typer.fail(
-        "PD401", f"the parameter `{name}` does not say its kind", default.span, "neither a percentage nor `yes` or `no`",
+        "PD401", f"the parameter `{name}` lacks a kind", default.span, "neither a percentage nor `yes` or `no`",
         f"write a percentage, or `{name}: {{type: {bounds}, default: {value}}}`",
     )  # fmt: skip
 
@@ -182,12 +182,12 @@ def _field(name: str, decl: FieldDecl, typer: Typer) -> Field:
     if decl.of is not None:
         of = frozenset(typer.set_of(typer.evaluate(decl.of, scope), decl.of.span).ids)
         if decl.at != "element":
-            label = "a field of a place belongs to no element"
+            label = "a field of places does not belong to elements"
             raise typer.fail("PD401", "`of` needs `at: element`", decl.of.span, label)
     if decl.tint is not None:
         if kind.name != "vec2":
             message, place = f"a field of kind {kind} tints nothing", decl.tint.name.span
-            fix = "cells show numbers and flags with `color_by`, under their element"
+            fix = "to show numbers and flags, use `color_by` of an element"
             raise typer.fail("PD401", message, place, "only vectors do", fix)
         most = typer.constant(decl.tint.most, CHANCE, scope) if decl.tint.most else 1
         tint = Tint(decl.tint.color, decl.tint.full, float(most))  # type: ignore[arg-type]  # a chance is a number
@@ -233,24 +233,24 @@ def _element_values(typer: Typer) -> dict[str, dict[str, tuple[str, Span, Syntax
 
 
 def _check_may_have(field: Field, number: int, element: str, span: Span, typer: Typer) -> None:
-    """Report that fresh cells of the element cannot have their own value of the field. Raises Poisoned."""
+    """Report that fresh cells of the element cannot have another default of the field. Raises Poisoned."""
     if field.at != "element":
-        label, fix = "a field of a place belongs to no element", "say `at: element`"
+        label, fix = "a field of places does not belong to elements", "write `at: element`"
     elif field.resets:
-        label, fix = "what resets has one default for all", "leave out `resets`, or set it in a pass"
+        label, fix = "a field that resets has one default", "omit `resets`, or set the field in a pass"
     elif field.of is not None and number not in field.of:
         label, fix = f"`of:` leaves `{element}` out", f"add `{element}` to `of:`"
     else:
         return
-    message = f"`{element}` cannot have a `{field.name}` of its own"
+    message = f"`{element}` cannot have its own `{field.name}`"
     raise typer.fail("PD407", message, span, label, fix, secondary=[Label(field.span, "declared here")])
 
 
 def _value(prop: Property, syntax: Syntax, pack: str, typer: Typer) -> Value | str:
-    """A property's value as a pack gives it. It may name a parameter, which stays changeable."""
+    """A property's value as written in a pack. It may be a parameter, which remains adjustable."""
     scope, kind = Scope(pack, {}), prop.kind
     if syntax.kind == "name" and typer.find(syntax.text, syntax.span, scope) is None:
-        message, label = f"`{syntax.text}` is no value of `{prop.name}`", f"expected {describe_kind(kind)}"
+        message, label = f"`{syntax.text}` is not a value of `{prop.name}`", f"expected {describe_kind(kind)}"
         fix = f"write {describe_kind(kind)}, or a parameter of this pack"
         typer.fail("PD110", message, syntax.span, label, fix)
         return default_of(kind)
@@ -261,7 +261,7 @@ def _value(prop: Property, syntax: Syntax, pack: str, typer: Typer) -> Value | s
         if expr.kind.name == kind.name and kind.lo <= expr.kind.lo <= expr.kind.hi <= kind.hi:
             return str(expr.value)
         label, fix = f"it is {expr.kind}", f"declare it as {kind}"
-        typer.fail("PD402", f"the parameter may leave {kind}", syntax.span, label, fix)
+        typer.fail("PD402", f"the parameter may exceed {kind}", syntax.span, label, fix)
     return default_of(kind)
 
 
@@ -298,7 +298,7 @@ def element_ramps(typer: Typer) -> dict[str, ColorRamp]:
 
 
 def _ramp(field: Field, element: Element, decl: RampDecl, typer: Typer) -> ColorRamp:
-    """The ramp of an element. Raises Poisoned after reporting that cells cannot show the field, or not this range."""
+    """The ramp of an element. Raises Poisoned after reporting that cells cannot have the field or the range."""
     kind, declared = field.kind, [Label(field.span, "declared here")]
     if kind.name not in ORDERED:
         fix = "a color follows numbers and flags: LOW..HIGH, real(LOW..HIGH), flag"
@@ -313,8 +313,8 @@ def _ramp(field: Field, element: Element, decl: RampDecl, typer: Typer) -> Color
     least, most = (0, 1) if kind.name == "flag" else (int(kind.lo), int(kind.hi))
     lo, hi = read_bounds(decl.over, typer) if decl.over is not None else (least, most)
     if not least <= lo <= hi <= most and decl.over is not None:
-        message, label = f"`{field.name}` does not reach all of {lo}..{hi}", f"its values are {least}..{most}"
-        fix = f"write a range within `{least}..{most}`, or leave out `over` for all of it"
+        message, label = f"{lo}..{hi} exceeds the range of `{field.name}`", f"its values are {least}..{most}"
+        fix = f"write a range within `{least}..{most}`, or omit `over` to use all of it"
         raise typer.fail("PD402", message, decl.over.span, label, fix, secondary=declared)
     if lo == hi:
         place, label = (decl.over or decl.field).span, "the color cannot change here"
@@ -323,7 +323,7 @@ def _ramp(field: Field, element: Element, decl: RampDecl, typer: Typer) -> Color
     return ColorRamp(field.name, decl.start or element.color, decl.end, lo, hi, kind.name == "real")
 
 
-# Values of parameters from elsewhere than rule files: commands, tasks, studies and programs
+# Values of parameters from commands, tasks, studies and programs
 
 
 def set_params(ruleset: Ruleset, values: Mapping[str, Any], reporter: Reporter) -> Ruleset:
@@ -350,15 +350,15 @@ def set_params(ruleset: Ruleset, values: Mapping[str, Any], reporter: Reporter) 
 
 
 def describe_kind(kind: Kind) -> str:
-    """The values of a kind, for a message that asks for one."""
+    """The values of a kind, in words for messages."""
     wanted = f"{'an integer' if kind.name == 'int' else 'a number'} from {kind.lo:g} to {kind.hi:g}"
     return {"flag": "`yes` or `no`", "chance": "a chance from 0% to 100%"}.get(kind.name, wanted)
 
 
 def param_value(kind: Kind, value: Any) -> Value | None:
-    """The value of a kind for a text (``"5%"``, ``"yes"``) or a number; None if it has none."""
+    """Convert a text (``"5%"``, ``"yes"``) or a number to a value of a kind; None if it is not one."""
     text = value.strip() if isinstance(value, str) else ""
-    if not text.isascii():  # Python reads digits of other scripts, rules do not
+    if not text.isascii():  # unlike Python, rules do not allow digits of other scripts
         return None
     try:
         number = float(text[:-1]) / 100 if text.endswith("%") else float(FLAG_WORDS.get(text, value))

@@ -52,7 +52,7 @@ from powderdsl.system.random import name_number
 MAX_MOMENTS = 1000
 MAX_RULES = 5000
 MAX_TRIED = 4 * MAX_RULES
-"""Rules with all their copies, and loops: wrong, inactive and repeated ones included."""
+"""Rules, with all their copies, and loops, including wrong, inactive and repeated ones."""
 
 _QUARTERS: tuple[Matrix, ...] = (IDENTITY, ((0, 1), (-1, 0)), ((-1, 0), (0, -1)), ((0, -1), (1, 0)))
 _MIRRORED: tuple[Matrix, ...] = tuple((rows, (-a, -b)) for rows, (a, b) in _QUARTERS)
@@ -67,7 +67,7 @@ ORIENTATIONS: dict[str | None, tuple[Matrix, ...]] = {
 
 
 class Elaborator:
-    """Turns declared passes into checked ones in order, and collects facts about rules that later checks need."""
+    """Turns declared passes into checked ones, in order, and collects facts about rules for later checks."""
 
     def __init__(self, typer: Typer):
         self.typer = typer
@@ -75,9 +75,9 @@ class Elaborator:
         self.streams: dict[str, Stream] = {}
         self.overridden: set[str] = set()
         self.inactive: dict[Span, str] = {}
-        """Rules with a copy that needs a name which is not loaded, and that name."""
+        """Rules with a copy that needs a name that is not loaded, and that name."""
         self.empty: dict[Span, str] = {}
-        """Rules that read a set or tag without elements, and its name."""
+        """Rules that read an empty set or tag, and its name."""
         self.active: set[Span] = set()
         """Rules with a copy whose names are all loaded."""
         self._rules = self._tried = 0
@@ -135,7 +135,7 @@ class Elaborator:
         rounds = self._rounds(block, scope, label)
         if rounds == [] and block.header is not None and not self.typer.reporter.has_errors:
             self.typer.reporter.report(
-                "PD506", "this loop has no rounds", block.header.span, "nothing to loop over",
+                "PD506", "this loop has no iterations", block.header.span, "nothing to loop over",
                 helps=["it becomes active with a pack that has such elements"],
             )  # fmt: skip
         for inner, inner_label in rounds:
@@ -188,7 +188,7 @@ class Elaborator:
             return value  # a stream's draws are fixed for the whole step
         if value.kind.name in ("draw", "chance"):
             value = self.typer.of_kind(value, REAL, syntax.span)
-        # Copies of a block fix the same name again: each copy gets its own, which earlier rules do not read.
+        # Copies of a block define the same name again: each copy gets its own, which earlier rules do not read.
         count = self._lets.get(name, 0)
         self._lets[name] = count + 1
         unique = name if count == 0 else f"{name}#{count + 1}"
@@ -213,7 +213,7 @@ class Elaborator:
         self._pending = []
 
     def _spend(self, tries: int, span: Span) -> None:
-        """Count rules and blocks that are tried. Raises Poisoned after reporting that loops unroll to too much."""
+        """Count rules and blocks. Raises Poisoned after reporting that loops unroll to too many."""
         self._tried += tries
         if self._tried > MAX_TRIED or self._rules > MAX_RULES or len(self._moments) >= MAX_MOMENTS:
             message = f"loops unroll to more than {MAX_MOMENTS} substeps or {MAX_RULES} rules"
@@ -260,7 +260,7 @@ class Elaborator:
             if clause := syntax.child(kind):
                 parts.append(self.typer.condition(clause.children[0], scope))
         if clause := syntax.child("chance"):
-            # Named by the rule's place, not by the number of rules unrolled before it: other packs shift nothing.
+            # Named by the rule's location, not by the number of rules before it, so that other packs shift nothing.
             label = f"[{self._label}]" if self._label else ""
             name = f"{self._decl.qualified}#{self._numbers[id(syntax)]}{label}"
             self.streams[name] = Stream(name, name_number(name), 32)
@@ -282,7 +282,7 @@ class Elaborator:
         if isinstance(behind, Place):
             if behind.offset != offset:
                 fix = f"write `leaving {where.span.text}`, or name an element"
-                message, label = "what is left behind is what was there", "another place than the target"
+                message, label = "the element left behind was there", "another place than the target"
                 raise self.typer.fail("PD405", message, leaving.span, label, fix)
         else:
             left = self.typer.of_kind(behind, ELEMENT, leaving.span)
@@ -302,9 +302,9 @@ class Elaborator:
         if syntax.text == ":=":
             expr = self.typer.of_kind(operand, kind, value.span)
             if kind.name == "int" and (expr.kind.lo < kind.lo or expr.kind.hi > kind.hi):
-                message = f"a value of {expr.kind} goes into `{name}`, which holds {kind}"
-                helps = [f"widen the field, or say `clamp(…, {kind.lo:g}, {kind.hi:g})`"]
-                label = "it is clamped to the bounds"
+                message = f"a value of {expr.kind} is assigned to `{name}`, whose range is {kind}"
+                helps = [f"widen the field, or write `clamp(…, {kind.lo:g}, {kind.hi:g})`"]
+                label = "it is clamped to the range"
                 self.typer.reporter.report("PD408", message, value.span, label, helps=helps)
         elif kind.name in ("int", "real", "vec2"):
             expr = self.typer.of_kind(operand, Kind(kind.name, -1e6, 1e6), value.span)

@@ -1,4 +1,4 @@
-"""Tests inside packs: small worlds drawn in ASCII, values of their fields drawn in words, and expected worlds."""
+"""Tests of packs: small worlds in ASCII, drawn values of fields, and expected worlds."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ FORMS = {
     "real": ("a number", "a number such as `3` or `-0.25`"),
     "vec2": ("a vector", "rows and columns, such as `1.5,-2`"),
 }
-"""For each kind: a noun for its words, and how they are written."""
+"""For each kind, a noun for its words, and their syntax."""
 
 _OCTANTS = {
     f"{first}.{second}".removesuffix(".here"): OCTANTS.index(plus(DIRECTIONS[first], DIRECTIONS[second]))
@@ -44,11 +44,11 @@ _WHOLE = r"-?[0-9]{1,7}"
 _NUMBER = r"-?[0-9]{1,7}(\.[0-9]{1,20})?([eE][-+]?[0-9]{1,2})?"
 
 Bounds = tuple[float, float]
-"""The lowest and the highest value that a word allows: twice the same, but for a range."""
+"""The lowest and highest value that a word allows, which differ only for a range."""
 
 
 class WordProblem(Exception):
-    """A word is not a value of its kind. Has a code, a message, a label, and maybe fixes."""
+    """A word is not a value of its kind. Has a code, a message, a label, and possibly fixes."""
 
     def __init__(self, code: str, message: str, label: str, *helps: str):
         super().__init__(message)
@@ -58,8 +58,8 @@ class WordProblem(Exception):
 def read_word(word: str, kind: Kind, ids: Mapping[str, int], *, ranges: bool = False) -> tuple[Bounds, ...]:
     """The bounds of each component of the value: two of a vector, one of other kinds.
 
-    `ids` are by the words of elements. With `ranges`, numbers may be ranges, `1..3`. Raises WordProblem if it is not a
-    value of this kind.
+    `ids` maps words to elements. With `ranges`, numbers may be ranges such as `1..3`. Raises WordProblem if the word is
+    not a value of this kind.
     """
     table = {"flag": FLAG_WORDS, "element": ids, "direction": _OCTANTS}.get(kind.name)
     values: list[Bounds] = []
@@ -76,7 +76,7 @@ def read_word(word: str, kind: Kind, ids: Mapping[str, int], *, ranges: bool = F
                 break
             if least > most:
                 label, fix = f"{low} is above {high}", f"write `{high}..{low}`"
-                raise WordProblem("PD402", "a range that runs backwards", label, fix)
+                raise WordProblem("PD402", "the bounds are reversed", label, fix)
             values.append((least, most))
     if not len(values) == len(parts) == 1 + (kind.name == "vec2"):
         noun, form = FORMS[kind.name]
@@ -87,7 +87,7 @@ def read_word(word: str, kind: Kind, ids: Mapping[str, int], *, ranges: bool = F
 
 
 def _number(word: str, kind: Kind) -> float | None:
-    """The number that a word spells; None for other words."""
+    """The number that a word represents; None for other words."""
     whole = kind.name == "int"
     if not re.fullmatch(_WHOLE if whole else _NUMBER, word):
         return None
@@ -95,12 +95,12 @@ def _number(word: str, kind: Kind) -> float | None:
     if not kind.lo <= value <= kind.hi:
         label = f"the range is {kind.lo:g}..{kind.hi:g}"
         fix = "write a number in this range, or widen it where it is declared"
-        raise WordProblem("PD402", f"{word} lies outside {kind}", label, fix)
+        raise WordProblem("PD402", f"{word} is out of range {kind}", label, fix)
     return int(value) if whole else float(clamp_number(value, kind))
 
 
 def direction_word(octant: int) -> str:
-    """A direction as drawings have it: `above.right`."""
+    """A direction as in drawings: `above.right`."""
     return next(word for word, number in _OCTANTS.items() if number == octant and not word.startswith("here"))
 
 
@@ -122,7 +122,7 @@ def check_examples(typer: Typer) -> tuple[Example, ...]:
         for known, element in composition.elements.items():
             for word in (known, element.qualified, element.word or known):
                 ids[word] = composition.elements[composition.element(word, name) or known].id
-        # Glyphs mean what they mean without packs that the author of the test does not know.
+        # Glyphs keep the meaning that they have without packs added later.
         alone = composition.glyphs_alone(composition.scope(name))
         for decl in pack.tests:
             with suppress(Poisoned, Unresolved):
@@ -131,7 +131,7 @@ def check_examples(typer: Typer) -> tuple[Example, ...]:
 
 
 class _ExampleReader:
-    """Reads one test. Its methods raise Poisoned after reporting, Unresolved for a test that waits for a pack.
+    """Reads one test. Its methods raise Poisoned after reporting, Unresolved for a test that needs an absent pack.
 
     `ids` are by the words of elements that the pack uses, and `glyphs` are theirs in its scope.
     """
@@ -214,11 +214,11 @@ class _ExampleReader:
         return values
 
     def _legend(self) -> dict[str, str]:
-        """The elements, by global name, that the characters of a test stand for."""
+        """The elements, by global name, of the characters of a test."""
         composition = self.composition
         legend = {element.glyph: name for name, element in composition.elements.items()}
         legend |= {glyph: name for name, glyph in self.glyphs.items()}
-        # What the pack's own file says comes first, whatever other packs took before.
+        # Glyphs of the pack's own file take precedence over those of other packs.
         for name, decl in composition.names.declared(ElementDecl).items():
             if decl.pack == self.pack and decl.glyph:
                 legend[decl.glyph] = name
@@ -226,58 +226,58 @@ class _ExampleReader:
             element = composition.element(value.word, self.pack)
             if element is None:
                 if value.is_optional:
-                    # A test of what packs do together waits until both are loaded.
+                    # A test of packs in combination is inactive until all are loaded.
                     raise Unresolved(value.word)
                 report_unknown("element", value, composition.elements, self.typer.reporter)
                 raise Poisoned
             if len(key.text) != 1:
                 raise self.typer.fail(
-                    "PD110", "a legend explains single characters", key.span, "not one character"
+                    "PD110", "a legend maps single characters", key.span, "not one character"
                 )
             legend[key.text] = element
         return legend
 
     def _check_sides(self, drawing: Scalar) -> None:
-        """Refuse sides that the test's pack and its needs do not allow; if only other packs do not, it is inactive."""
+        """Reject sides that the test's pack or its needs disallow; if only other packs do, it is inactive."""
         multiple, sides = self.composition.side_multiple, (len(self.given), len(self.given[0]))
         if not any(side % multiple for side in sides):
             return
         known = self.composition.names.needs[self.pack]
         least = lcm(*(self.composition.packs[pack].side_multiple for pack in known))
         if any(side % least for side in sides):
-            label = f"`side_multiple` asks for multiples of {multiple}"
+            label = f"`side_multiple` requires multiples of {multiple}"
             raise self.typer.fail("PD110", f"a world of {sides[0]}×{sides[1]} cells", drawing.span, label)
         self.typer.reporter.report(
             "PD506", "this test is inactive: its world has sides that these rules do not allow", self.decl.name.span, "left out",
-            notes=[f"a loaded pack asks for sides that are multiples of {multiple}"],
-            helps=["it becomes active without the pack that says `side_multiple`"],
+            notes=[f"a loaded pack requires sides that are multiples of {multiple}"],
+            helps=["it becomes active without the pack that sets `side_multiple`"],
         )  # fmt: skip
         raise Unresolved("side_multiple")
 
     def _rows(self, scalar: Scalar, *, wildcard: bool) -> tuple[str, ...]:
-        """The rows of a drawn world, a character a cell."""
+        """The rows of a drawn world, one character per cell."""
         comment = comment_after(scalar) if scalar.style == "plain" and "#" in self.legend else None
         if comment is not None:  # on the line of the key, `#` begins a comment of YAML
             whole = Span(comment.source, scalar.span.start, comment.end).text
             raise self.typer.fail(
-                "PD110", "a drawing that stops at a comment", comment, "a comment, to YAML",
+                "PD110", "a drawing cut short by a comment", comment, "a comment, to YAML",
                 f'put quotes around the drawing: "{whole}"', "or draw it on the next lines, below `|`",
             )  # fmt: skip
         rows = tuple("".join(line.split()) for line in scalar.text.splitlines() if line.strip())
         if not rows or len(set(map(len, rows))) != 1 or max(len(rows), len(rows[0])) > MAX_SIDE:
             label = f"expected 1 to {MAX_SIDE} equal rows"
-            raise self.typer.fail("PD110", "rows of a world are equally long", scalar.span, label)
+            raise self.typer.fail("PD110", "rows of a world must be equally long", scalar.span, label)
         for char in sorted(set("".join(rows)) - self.legend.keys()):
             if not (wildcard and char == "?"):
                 start = scalar.content.start + max(scalar.content.text.find(char), 0)
                 place = Span(scalar.span.source, start, start + 1)
                 known = " ".join(f"{glyph}={name}" for glyph, name in sorted(self.legend.items()))
                 raise self.typer.fail(
-                    "PD301", f"`{char}` stands for nothing", place, "not in the legend", f"known: {known}"
+                    "PD301", f"`{char}` has no meaning here", place, "not in the legend", f"known: {known}"
                 )
         return rows
 
-    # Drawn fields: all mistakes are reported, and words that come again are read once
+    # Drawn fields: all mistakes are reported, and repeated words are read once
 
     def _grids(
         self, drawn: Sequence[tuple[Scalar, Scalar]], ids: Mapping[str, int], size: str, *, expected: bool
@@ -306,7 +306,7 @@ class _ExampleReader:
         if not everywhere and list(map(len, rows)) != list(map(len, self.given)):
             raise self.typer.fail(
                 "PD110", f"`{key.text}` has another size than `given`", places[0] if places else key.span, size,
-                f"write a word for each cell, or one for all of them: {FORMS[kind.name][1]}",
+                f"write a word for each cell, or one for all cells: {FORMS[kind.name][1]}",
             )  # fmt: skip
         read: dict[str, Cell] = {DEFAULT: ()} | ({ANYTHING: None} if expected else {})
         for word, place in zip(words, places, strict=True):
@@ -314,8 +314,8 @@ class _ExampleReader:
                 continue
             try:
                 if word == ANYTHING:
-                    form, fix = FORMS[kind.name][1], f"write `{DEFAULT}` for what a fresh cell has"
-                    raise WordProblem("PD110", "a start world leaves nothing open", form, fix)
+                    form, fix = FORMS[kind.name][1], f"write `{DEFAULT}` for the value of a fresh cell"
+                    raise WordProblem("PD110", "a start world needs a value for every cell", form, fix)
                 read[word] = read_word(word, kind, ids, ranges=expected)
             except WordProblem as wrong:
                 self.typer.fail(wrong.code, wrong.message, place, wrong.label, *wrong.helps)
@@ -330,7 +330,7 @@ class _ExampleReader:
                 if cell and ids[character] not in field.of:
                     element = self.legend[character]
                     self.typer.reporter.error(
-                        "PD407", f"`{element}` has no `{key.text}`", place, f"the cell holds `{element}`",
+                        "PD407", f"`{element}` has no `{key.text}`", place, f"the cell contains `{element}`",
                         secondary=(Label(field.span, "only some elements have it"),),
                         helps=(f"write `{DEFAULT}` here, or add `{element}` to `of:` of `{key.text}`",),
                     )  # fmt: skip
@@ -343,7 +343,7 @@ class _ExampleReader:
         if symbol is not None:
             if symbol.kind.name in FORMS:
                 return symbol.kind
-            label = f"no cell has {symbol.kind} of its own"
+            label = f"cells do not store {symbol.kind}"
             raise self.typer.fail("PD407", f"`{name}` is not a field", key.span, label)
         if symbols.is_declared(name, self.pack):
             raise Poisoned  # what is wrong with its declaration has been reported
@@ -354,7 +354,7 @@ class _ExampleReader:
 
 
 def check_assigned(examples: Sequence[Example], symbols: Composition, reporter: Reporter) -> None:
-    """Refuse drawn properties that follow from the element: only what rules assign can differ."""
+    """Reject drawn properties that follow from the element: only those that rules assign can differ."""
     elements = symbols.elements
     for example in examples:
         legend = dict(example.legend)
@@ -363,16 +363,16 @@ def check_assigned(examples: Sequence[Example], symbols: Composition, reporter: 
             if prop is None:
                 continue
             if not prop.stored:
-                helps = ["a test of what rules assign to it needs such a rule; otherwise leave it out"]
+                helps = ["draw it only if a rule assigns it; otherwise omit it"]
                 message, label = f"no rule assigns `{grid.name}`", "it follows from the element"
                 reporter.error("PD407", message, grid.span, label, helps=helps)
                 continue
             if grid.everywhere or grid in example.expect_fields:
-                continue  # it counts where it can, or is compared with what the world has
+                continue  # it applies where it can, or is compared with the world's values
             cells = zip(chain.from_iterable(grid.cells), "".join(example.given), strict=True)
             names = (legend[character] for cell, character in cells if cell)
             name = next((name for name in names if elements[name].id not in prop.stored), None)
             if name is not None:
                 message = f"no rule assigns `{grid.name}` of `{name}`"
-                label = f"a cell that holds `{name}` has a value here"
+                label = f"a cell that contains `{name}` has a value here"
                 reporter.error("PD407", message, grid.span, label, helps=["write `.` for such cells"])

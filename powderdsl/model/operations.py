@@ -1,4 +1,4 @@
-"""Every operation of the language in one table, a row each.
+"""Every operation of the language, in one table.
 
 The words of functions, their arguments' kinds, the folding of constants, ranges of integers, the search of
 `logic.satisfy`, the printed model, the lowering, random rules and the table in `docs/language/expressions.md` follow from it. The
@@ -27,18 +27,18 @@ NUMBER, PLACE = Kind("number"), Kind("place")
 class Operation:
     """A row of `OPERATIONS`.
 
-    about: one sentence; of a function, as `docs/language/expressions.md` has it. `value` is what an `Expr` of it has besides its
-        arguments.
-    usage: how rules call it; nothing for an operation that is written in another way.
-    takes: the kinds of the arguments. Without them a function has a check of its own in `expressions.operators`.
-    gives: the kind of the result. Without one it is an integer with the range of `between`, or a float.
-    most: how many arguments it may have, if that is more than `usage` has.
-    meaning: an expression of the language, in the names of the arguments, that stands for a call.
-    sign, binds: how it is written between its arguments, or before one, and how tightly it binds.
-    lowers: the operation of the IR that it is, if that has another name.
+    about: one sentence, which for functions appears in `docs/language/expressions.md`. `value` is the further argument
+        of an `Expr` of this operation.
+    usage: the syntax of a call; empty for operations with another syntax.
+    takes: the kinds of the arguments. Without them, a function has its own check in `expressions.operators`.
+    gives: the kind of the result. Without one, it is an integer with the range of `between`, or a float.
+    most: the maximum number of arguments, if more than in `usage`.
+    meaning: an equivalent expression of the language, in the names of the arguments.
+    sign, binds: the operator between its arguments, or before one, and its precedence.
+    lowers: its operation in the IR, if that has another name.
     evaluate: the exact value for the values of the arguments, and `value` if there is one.
-    monotone: between bounds of the arguments, the extremes of the value lie where those of the arguments do.
-    bounds: the bounds of the value for those of the arguments, where it is not monotone.
+    monotone: the extremes of the value are at extremes of the arguments.
+    bounds: the bounds of the value for those of the arguments, if it is not monotone.
     """
 
     name: str
@@ -61,7 +61,7 @@ class Operation:
         return self.usage.partition("(")[2].rstrip(")").removesuffix(", …").split(", ")
 
     def between(self, *bounds: Bounds) -> Bounds | None:
-        """The bounds of the value for those of the arguments, if they follow; flags are 0, 1, False or True."""
+        """The bounds of the value for those of the arguments, if known; flags are 0, 1, False or True."""
         if self.bounds is not None:
             return self.bounds(*bounds)
         if not self.monotone or self.evaluate is None:
@@ -75,7 +75,7 @@ def _abs_bounds(a: Bounds) -> Bounds:
 
 
 def _quotient_bounds(a: Bounds, b: Bounds) -> Bounds:
-    """The bounds of a quotient by divisors of one sign: the extremes lie at the ends of both ranges."""
+    """The bounds of a quotient by divisors of one sign: the extremes are at the ends of both ranges."""
     divisors = [d for d in (b[0], min(b[1], -1), max(b[0], 1), b[1]) if d and b[0] <= d <= b[1]]
     corners = [x // d for x in a for d in divisors] + [0] * (b[0] <= 0 <= b[1])
     return min(corners), max(corners)
@@ -87,7 +87,7 @@ _TABLE = (
     Operation("param", "value: the parameter's qualified name"),
     Operation("element", "the element of this cell"),
     Operation(
-        "property", "value: the property's name, as this cell's element has it (or as the cell overrides it)"
+        "property", "value: the name of the property, of this cell's element or overridden in the cell"
     ),
     Operation("field", "value: the field's name, or a pass's scratch field"),
     Operation("let", "value: the name of a value fixed earlier in the pass"),
@@ -104,12 +104,12 @@ _TABLE = (
     Operation("at", "the neighbor ROWS down and COLUMNS right", "at(ROWS, COLUMNS)"),
     Operation(
         "inside",
-        "whether that neighbor lies inside the grid",
+        "whether that neighbor is inside the grid",
         "inside(PLACE)",
         (PLACE,),
         FLAG,
     ),
-    Operation("look", "value: offset; the argument as it is at that neighbor (the grid wraps around)"),
+    Operation("look", "value: offset; the argument at that neighbor (the grid wraps around)"),
     # Vectors
     Operation("octant", "the direction a vector points to", "octant(VEC2)", (VEC2,), DIRECTION),
     Operation("length", "the length of a vector", "length(VEC2)", (VEC2,), REAL),
@@ -189,7 +189,7 @@ _TABLE = (
 )
 
 OPERATIONS: dict[str, Operation] = {row.name: row for row in _TABLE}
-"""Every operation of the language. The model has no `at`, no `pick`, and no function with a `meaning`."""
+"""Every operation of the language. The model does not contain `at`, `pick`, or functions with a `meaning`."""
 
 FUNCTIONS: dict[str, Operation] = {row.name: row for row in _TABLE if row.usage}
 """The operations that rules call by name."""

@@ -1,6 +1,6 @@
 """The oracle: a slow, obvious NumPy interpreter of the checked model. It defines what rules mean.
 
-It shares nothing with the compiler: no IR, no passes. Arrays are [B, H, W] ([B, 2, H, W] for vectors). Integers
+It shares no code with the compiler: no IR, no passes. Arrays are [B, H, W] ([B, 2, H, W] for vectors). Integers
 are int64 here, floats float32 with one rounding an operation, draws float64.
 """
 
@@ -57,7 +57,7 @@ class Clock:
 
 
 def mix(x: Array, key: Any = 0) -> Array:
-    """A 32-bit finaliser (xor-shift-multiply), with a key before its last round. uint64 arrays, of 32 bits each."""
+    """A 32-bit finalizer (xor-shift-multiply) with a key before the last round, on uint64 arrays of 32-bit numbers."""
     mask = 0xFFFFFFFF
     x = x & mask
     x = x ^ (x >> 16)
@@ -99,7 +99,7 @@ def draw(clock: Clock, stream: int, bits: int, height: int, width: int) -> Array
 
 
 def look(value: Array, offset: Offset) -> Array:
-    """The array as seen from each cell at its neighbor `offset`; the grid wraps around."""
+    """The array's value at the neighbor `offset` of each cell; the grid wraps around."""
     return np.roll(value, (-offset[0], -offset[1]), (-2, -1)) if any(offset) else value
 
 
@@ -109,14 +109,14 @@ def back(offset: Offset) -> Offset:
 
 
 def inside(shape: tuple[int, ...], offset: Offset) -> Array:
-    """bool [H, W]: True where the neighbor lies inside the grid."""
+    """bool [H, W]: True where the neighbor is inside the grid."""
     height, width = shape
     y, x = np.arange(height)[:, None] + offset[0], np.arange(width) + offset[1]
     return (y >= 0) & (y < height) & ((x >= 0) & (x < width))
 
 
 def neighborhood(value: Array, kernel: Kernel) -> Array:
-    """The weighted sum over a kernel: each row from the left, then the rows from the top."""
+    """The weighted sum over a kernel, by rows from the top, each from the left."""
     rows: dict[int, Array] = {}
     for dy, dx, weight in kernel.weights:
         seen = look(value, (dy, dx))
@@ -131,7 +131,7 @@ def neighborhood(value: Array, kernel: Kernel) -> Array:
 
 
 class Change(NamedTuple):
-    """A write of a slot: by a rule, or by every step.
+    """A write to a slot, by a rule or in every step.
 
     `origin` is the offset from a written cell to the cell in which the rule's condition holds, `source` the offset to the
     cell that the new content comes from.
@@ -145,10 +145,10 @@ class Change(NamedTuple):
 
 
 class Watch(Protocol):
-    """Receives the events of a step. Contexts change after each event."""
+    """Receives the events of a step. Contexts are mutated after each event."""
 
     def begins(self, moment: Moment, at: Context, masks: Mapping[int, Array]) -> None:
-        """The lets of a substep are fixed; `masks` has the cells in which each rule will happen, by `id`."""
+        """The lets of a substep are fixed; `masks` has the cells in which each rule will fire, by `id`."""
 
     def wrote(self, change: Change, before: Array, after: Array, mask: Array | None = None) -> None:
         """A slot was written where the mask holds; without a mask, anywhere."""
@@ -156,7 +156,7 @@ class Watch(Protocol):
 
 @dataclass
 class Context:
-    """The inputs of expressions: the world before the substep, values fixed earlier, draws, parameters."""
+    """The inputs of expressions: the world before the substep, earlier lets, draws, and parameters."""
 
     ruleset: Ruleset
     state: State
@@ -191,7 +191,7 @@ def _property(expr: Expr, at: Context) -> Array:
 
 @functools.cache
 def _members(some: frozenset[int]) -> Array:
-    """bool [256], by id: whether it is one of some elements."""
+    """A table of elements by id, bool [256]."""
     return np.asarray([number in some for number in range(256)])
 
 
@@ -270,13 +270,13 @@ _OPS: dict[str, Any] = {
 }
 
 
-# Floats, step by step: each rounds once, to float32. Another order of these steps would give other bits.
+# Floats, step by step: each rounds once, to float32. Reordering these steps would change bits.
 
 NEAR, FAR = 0.92387953251128674, 0.38268343236508977
 """cos(π/8) and cos(3π/8): the borders of the octants."""
 
 HALF_PI = (1.5703125, 0.0004837512969970703125, 7.549789954891609e-08)
-"""π/2 in three parts, the first two of so few bits that small multiples of them are exact."""
+"""π/2 in three parts, the first two with few enough bits that small multiples are exact."""
 
 SERIES = ((-1 / 6, 1 / 120, -1 / 5040, 1 / 362880), (1 / 24, -1 / 720, 1 / 40320, -1 / 3628800))
 """Coefficients of the sine from x³ on, and of the cosine from x⁴ on."""
@@ -293,7 +293,7 @@ def length(v: Array) -> Array:
 def wave(x: Array, *, cosine: bool) -> Array:
     """The sine or cosine of angles in radians, within 2⁻²² for those up to 1000.
 
-    x is the q-th multiple of π/2 plus a rest, and what rounding took off the rest. Both waves follow from its series.
+    x is the q-th multiple of π/2 plus a remainder, and the rounding error of the remainder, to which the series apply.
     """
     sine, cosine_of = ([np.float32(number) for number in row] for row in SERIES)
     rounder, whole = np.float32(ROUNDER), np.float32(1)
@@ -349,7 +349,7 @@ def run_moment(moment: Moment, at: Context, table: Mapping[str, Slot]) -> State:
             at.watch.wrote(change, old, state[name], mask)
 
     def assign(how: str, rule: Rule, assignment: Assign) -> None:
-        """`field op value` at the cell `offset` away from each cell where the rule happens."""
+        """`field op value` at the cell `offset` away from each cell where the rule fires."""
         slot, place = table[assignment.field], back(assignment.offset)
         value = _apply_write(assignment, slot.kind, state[slot.name], look(values[id(assignment)], place))
         write(Change(how, slot, rule, place), value, look(masks[id(rule)], place))
@@ -360,7 +360,7 @@ def run_moment(moment: Moment, at: Context, table: Mapping[str, Slot]) -> State:
             write(Change(how, slot, rule), _in_fresh_cells(slot, ids, at), masks[id(rule)])
 
     def arrive(rule: Swap | Move, source: Offset, origin: Offset = (0, 0)) -> None:
-        """Content comes from the neighbor `source` where the rule's condition holds in the neighbor `origin`."""
+        """Contents come from the neighbor `source` where the rule's condition holds in the neighbor `origin`."""
         mask = look(masks[id(rule)], origin)
         for slot in traveling:
             write(Change("arrive", slot, rule, origin, source), look(before[slot.name], source), mask)
@@ -390,7 +390,7 @@ def run_moment(moment: Moment, at: Context, table: Mapping[str, Slot]) -> State:
 
 
 def masks_of(moment: Moment, at: Context) -> dict[int, Array]:
-    """The cells in which each rule of a substep happens, bool [B, H, W] by `id`. `at.lets` has the substep's lets."""
+    """The cells in which each rule of a substep fires, bool [B, H, W] by `id`. `at.lets` has the substep's lets."""
     masks = {id(rule): evaluate(rule.mask, at) for rule in moment.rules}
     if moment.policy in ("drop_both", "first_wins"):
         claims = [rule for rule in moment.rules if not isinstance(rule, Assign)]
@@ -423,7 +423,7 @@ def _in_fresh_cells(slot: Slot, ids: Array, at: Context) -> Array:
 
 
 def _apply_write(assign: Assign, kind: Kind, old: Array, value: Array) -> Array:
-    """`old op value`; integers are cut off."""
+    """`old op value`; integers are clamped."""
     new = value if assign.op == ":=" else old + value if assign.op == "+=" else old - value
     return np.clip(new, int(kind.lo), int(kind.hi)) if kind.name == "int" else new
 
@@ -444,7 +444,7 @@ def _settle_claims(policy: str, claims: list[Any], masks: dict[int, Array]) -> N
     for rule in claims:
         mask = wanted[id(rule)]
         if isinstance(rule, Swap) or (isinstance(rule, Move) and rule.leaving is not None):
-            # Pairs of one rule that share a cell have no order: none happens. Those that trade places move in rows.
+            # Pairs of one rule that share a cell have no order, so none fires. Those that trade places move in rows.
             mask = mask & ~(look(mask, rule.offset) | look(mask, back(rule.offset)))
         if policy == "drop_both":
             for other in claims:
@@ -460,7 +460,7 @@ def _settle_claims(policy: str, claims: list[Any], masks: dict[int, Array]) -> N
 
 
 def clamp(state: State, table: Mapping[str, Slot]) -> State:
-    """The state with float fields within their range, and zero for NaN and magnitudes below SNAP."""
+    """The state with float fields clamped to their range, and NaN and magnitudes below SNAP set to zero."""
     result = dict(state)
     for name, slot in table.items():
         if slot.is_real:
@@ -497,7 +497,7 @@ def widen(ruleset: Ruleset, state: Mapping[str, Array]) -> State:
 
 
 def parameters(ruleset: Ruleset, batch: int, values: Mapping[str, Any]) -> dict[str, Array]:
-    """All parameters as arrays [B]: numbers or arrays [B] that are given, and the defaults of the others."""
+    """All parameters as arrays [B]: the given numbers or arrays, and defaults of the others."""
     return {
         param.name: np.broadcast_to(
             np.asarray(values.get(param.name, float(param.default)), np.float64), (batch,)
@@ -524,8 +524,8 @@ def step(
         clock: the inputs of the random numbers.
         params: [B] arrays by qualified name.
         passes: names of the passes to run; all of them by default.
-        draws: float64 [B, H, W] in [0, 1) by stream name, instead of our own numbers.
-        tick: called with the name of each pass when it is done.
+        draws: float64 [B, H, W] in [0, 1) by stream name, to use instead of random numbers.
+        tick: called with the name of each finished pass.
         watch: receives each substep and each write.
     """
     table = {slot.name: slot for slot in slots(ruleset)}

@@ -20,10 +20,10 @@ RECORDS: dict[str, type[Record]] = {}
 
 @dataclass_transform(frozen_default=True, kw_only_default=True)
 class Record:
-    """A mapping in a file, as a frozen dataclass. Its fields that are declared with `keyed` have a key.
+    """A mapping in a file, as a frozen dataclass. Fields declared with `keyed` have a key.
 
-    `noun` has its article. `others` is the noun for further keys, if any are allowed: their values are lines, and the
-    record has them in `values`. `prefixes` begin keys that are lines themselves: `for side in (left, right)`.
+    `noun` includes its article. `others` is the noun for further keys, if allowed, whose values are lines and are
+    stored in `values`. `prefixes` begin keys that are lines themselves: `for side in (left, right)`.
     """
 
     NOUN: ClassVar[str] = ""
@@ -36,7 +36,7 @@ class Record:
 
 
 class Entry(Record):
-    """A record below a key, which is its name. Keys of records with a noun are new names."""
+    """A record under a key that is its name. Keys of records with a noun are new names."""
 
     name: Scalar
 
@@ -47,7 +47,7 @@ E = TypeVar("E", bound=Entry)
 
 @dataclass(frozen=True)
 class Form:
-    """The form of a word: a pattern, a noun for such words, the label and the fix for others, and its reader."""
+    """The form of a word: a pattern, a noun for such words, the label and the fix for other words, and a reader."""
 
     pattern: str
     noun: str
@@ -61,32 +61,32 @@ class Form:
 NAME_FORM = Form(
     r"[A-Za-z0-9][A-Za-z0-9_-]{0,59}", "a name", "letters, digits, `-` and `_`, up to 60", code="PD111"
 )
-"""Names of tasks, scenes and studies, which are also names of files."""
+"""Names of tasks, scenes and studies, which are also file names."""
 
 
 @dataclass(frozen=True)
 class Key:
     """A key of a record.
 
-    `shape` follows from the field's type unless the declaration says another one: ``text word words number flag line
+    `shape` follows from the field's type unless declared: ``text word words number flag line
     lines invariants record section pairs``. The node of a ``mapping``, ``list``, ``block`` or ``any`` is kept.
     """
 
     about: str
-    """One line for messages, the docs and the JSON Schema."""
+    """A description for messages, the docs and the JSON Schema, in one line."""
     name: str = ""
     """The key, if it is not the field's name."""
     required: bool = False
-    """True if the file must have it. A field without a default is required too: without it there is no record."""
+    """True if the file must have it. A field without a default is always required."""
     choices: tuple[str, ...] = ()
     bounds: tuple[int, int] = (0, 0)
     """Of a number."""
     form: Form | None = None
     """Of a word."""
     short: bool = False
-    """True if an entry that is not a mapping is the value of this key."""
+    """True if an entry that is not a mapping sets this key."""
     maps: str = ""
-    """The keys and values of a mapping that is not a record: "parameters to values"."""
+    """The keys and values of a mapping that is not a record, such as "parameters to values"."""
     shape: str = ""
     field: str = ""
     type: Any = None
@@ -145,7 +145,7 @@ _MEANT = {
     "state": "fields",
     "constants": "params",
 }
-"""Keys that people expect, and the key that is meant."""
+"""Keys that users may expect, and the actual key."""
 
 NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_]*\Z")
 MAX_NAME = 40
@@ -169,7 +169,7 @@ def comment_after(scalar: Scalar) -> Span | None:
 
 
 def read_tree(source: Source, reporter: Reporter, start: str) -> Node | None:
-    """The located tree of a file, or None after a report. `start` says how such files start."""
+    """The located tree of a file, or None after a report. `start` is the expected start of the file."""
     tree = parse_yaml(source, reporter)
     if tree is None and not reporter.has_errors:
         reporter.error("PD107", f"{source.name} is empty", None, helps=[start])
@@ -191,7 +191,7 @@ class Reader:
     def record(self, kind: type[R], node: Node, what: str, **known: Any) -> R | None:
         """The record of a mapping; None after a report if a field without a default has no value.
 
-        Other fields that are absent, or wrong and reported, have their defaults.
+        Other fields that are absent, or wrong and reported, get their defaults.
         """
         return self.build(kind, **known, **self.values(kind, self.mapping(kind, node, what)))
 
@@ -229,7 +229,7 @@ class Reader:
         return values | {"values": tuple(others)} if kind.OTHERS else values
 
     def value(self, row: Key, key: Scalar, node: Node) -> Any:
-        """The value of a key as its row says, None after a report."""
+        """The value of a key according to its row, None after a report."""
         about = f"`{key.text}`: {row.about}"
         match row.shape:
             case "words":
@@ -285,7 +285,7 @@ class Reader:
             elif key.text.startswith(kind.PREFIXES) or (kind.OTHERS and not misspelled):
                 entries[key.text] = (key, value)
             else:
-                missing -= set(misspelled)  # a key that is there under a wrong name is one mistake
+                missing -= set(misspelled)  # a misspelled key is one mistake
                 self.reporter.error(
                     "PD108", f"unknown key `{key.text}`", key.span, f"not a key of {what}",
                     helps=self._key_help(key.text, kind, what),
@@ -299,7 +299,7 @@ class Reader:
         return entries
 
     def _is_empty(self, key: Scalar, value: Node, row: Key) -> bool:
-        """True if a key lacks its value, which YAML may take for a comment. Reports the missing value."""
+        """True after reporting that a key lacks its value, which YAML may have read as a comment."""
         if isinstance(value, Scalar):
             is_empty = value.style == "plain" and not value.text
         else:
@@ -318,7 +318,7 @@ class Reader:
             return False
         self.reporter.report(
             "PD113", f"`{key.text}` is empty", key.span, "it has no entries",
-            helps=[f"`{key.text}`: {row.about}", "remove it, or indent what belongs to it"],
+            helps=[f"`{key.text}`: {row.about}", "remove it, or indent its contents"],
         )  # fmt: skip
         return True
 
@@ -326,11 +326,11 @@ class Reader:
         """The fix for an unknown key: what it should be called, where it belongs, or that it is a rule."""
         known = keys_of(kind)
         if any(sign in word for sign in ("->", ":=", " swaps ", " moves ", "swap ")):
-            return ("YAML takes text before `: ` for a key: quote the rule",)
+            return ("YAML reads text before `: ` as a key: quote the rule",)
         if kind.PREFIXES and word == "repeat":
-            return ("say how often: `repeat 3:`",)
+            return ("write a number of repetitions: `repeat 3:`",)
         if kind.PREFIXES and word == "for":
-            return ("say over what: `for side in (left, right):`",)
+            return ("write a loop variable and its values: `for side in (left, right):`",)
         if _MEANT.get(word) in known:
             return (f"did you mean `{_MEANT[word]}`?",)
         close = suggest(word, known, f"keys of {what}")
@@ -387,7 +387,7 @@ class Reader:
             return True
         odd = look_alikes(key.text)
         if odd:
-            word, label = spell(word), "not all of it is plain ASCII"
+            word, label = spell(word), "it is not plain ASCII"
             helps = ["type these again: " + ", ".join(shown_character(char) for char in odd)]
         else:
             label = "letters, digits and `_`, a letter first"

@@ -9,13 +9,12 @@ from typing import Any
 from powderdsl.model.types import ELEMENT, Field, Kind, Pass, Property, Ruleset
 
 SNAP = 2.0**-20
-"""Smaller magnitudes of float fields are flushed to zero: motion dies out, and no backend meets denormal numbers."""
+"""Smaller magnitudes of float fields are flushed to zero: motion stops, and backends never see denormal numbers."""
 
 
 @dataclass(frozen=True)
 class Slot:
-    """One array of a world's state. `travels` says that it moves with the element; `own` are the defaults of single
-    elements, by id."""
+    """One array of a world's state. `travels`: it moves with the element; `own`: defaults of elements, by id."""
 
     name: str
     kind: Kind
@@ -54,7 +53,7 @@ def storage(kind: Kind) -> str:
 
 
 def stored_range(kind: Kind) -> tuple[float, float]:
-    """The smallest and the largest number in which values of a kind are stored or given."""
+    """The smallest and largest number that values of a kind are stored or given as."""
     known = {"flag": (0, 1), "chance": (0, 1), "direction": (0, 7), "element": (0, 255)}
     return known.get(kind.name, (kind.lo, kind.hi))
 
@@ -72,7 +71,7 @@ def slots(ruleset: Ruleset) -> tuple[Slot, ...]:
 
 
 def property_dtype(prop: Property) -> str:
-    """The dtype of a property whose values follow from the element."""
+    """The dtype of a property that is determined by the element."""
     if prop.kind.name == "chance":
         return "float32"
     if prop.kind.name == "int":
@@ -81,7 +80,7 @@ def property_dtype(prop: Property) -> str:
 
 
 def property_values(ruleset: Ruleset, name: str) -> list[float]:
-    """A property's values by id, parameters at their defaults: 256 of them, 0 for ids that no element has."""
+    """The 256 values of a property by id, with parameters at their defaults; 0 for unused ids."""
     prop = ruleset.property(name)
     assert prop is not None
     defaults = {param.name: param.default for param in ruleset.params}
@@ -103,7 +102,7 @@ def fresh_values(ruleset: Ruleset, slot: Slot) -> list[Any]:
 
 
 def scratch_slots(pass_: Pass) -> dict[str, Slot]:
-    """The slots of a pass's scratch fields by name. They live in the pass and are not stored."""
+    """The slots of a pass's scratch fields by name. They exist only during the pass and are not stored."""
     return {
         field.name: Slot(field.name, field.kind, field.default, travels=False, resets=True)
         for field in pass_.scratch
@@ -122,7 +121,7 @@ def slot_name(ruleset: Ruleset, name: str) -> str:
 
 
 def fits(ruleset: Ruleset, size: tuple[int, ...]) -> bool:
-    """True if worlds of this many rows and columns may follow the rules."""
+    """True if the rules allow worlds of this size."""
     return all(side % ruleset.side_multiple == 0 for side in size[-2:])
 
 
@@ -132,11 +131,11 @@ def size_problem(ruleset: Ruleset, size: tuple[int, ...]) -> str:
 
 
 def check_sides(ruleset: Ruleset, size: tuple[int, int]) -> None:
-    """Raises ValueError for a size that does not fit."""
+    """Raise ValueError for a size that the rules do not allow."""
     if not fits(ruleset, size):
         raise ValueError(size_problem(ruleset, size))
 
 
 def fitting(ruleset: Ruleset, side: int) -> int:
-    """The smallest side, not smaller than this one, that fits."""
+    """The smallest allowed side that is at least this one."""
     return -(-side // ruleset.side_multiple) * ruleset.side_multiple

@@ -1,4 +1,4 @@
-"""Rules as text, as parsed and as checked: one line a definition and a rule, each with its place."""
+"""Rules as text, as parsed and as checked: one line per definition and rule, with its location."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ _PLACES = {offset: name for name, offset in DIRECTIONS.items()}
 
 
 def print_model(ruleset: Ruleset, passes: Collection[str] | None = None) -> str:
-    """The whole model, or only these passes of it. Ends with a line break; equal models give equal texts."""
+    """The model, or only some of its passes, as text that ends with a line break. Equal models give equal texts."""
     printer = _Printer(ruleset)
     shown = (item for item in ruleset.passes if passes is None or item.name in passes)
     blocks = ["\n".join(printer.pass_lines(item)) for item in shown]
@@ -49,7 +49,7 @@ def print_model(ruleset: Ruleset, passes: Collection[str] | None = None) -> str:
 
 
 def print_tree(packs: Iterable[PackDecl], pass_name: str | None = None) -> str:
-    """Packs as parsed, or only a pass of them: each line as written, with its place, above its syntax tree."""
+    """Packs as parsed, or only one of their passes: each line as written, with its location, above its syntax tree."""
     lines: list[str] = []
     for pack in packs:
         if pass_name is not None:
@@ -86,17 +86,17 @@ def _tree_lines(key: str, value: object, indent: str) -> Iterator[str]:
 
 
 def place_of(span: Span) -> str:
-    """The place of a span as text: `file:line`."""
+    """The location of a span as text: `file:line`."""
     return f"{span.source.name}:{span.line}"
 
 
 def one_line(span: Span) -> str:
-    """The text of a span, its line breaks as blanks."""
+    """The text of a span, with line breaks replaced by spaces."""
     return " ".join(span.text.split())
 
 
 def show_number(value: float | Fraction) -> str:
-    """A number as short as it can be written exactly: `7`, `0.5`, `1/3`."""
+    """The shortest exact form of a number: `7`, `0.5`, `1/3`."""
     if isinstance(value, Fraction) and value != Fraction(str(float(value))):
         return str(value)
     number = float(value)
@@ -104,14 +104,14 @@ def show_number(value: float | Fraction) -> str:
 
 
 def show_single(value: float) -> str:
-    """A float32 as the shortest text that means it."""
+    """The shortest text that represents a float32."""
     texts = (f"{value:.{digits}g}" for digits in range(1, 9))
     text = next((text for text in texts if array("f", [float(text)])[0] == value), f"{value:.9g}")
     return repr(float(text))
 
 
 def show_value(ruleset: Ruleset, kind: Kind, value: Value | str) -> str:
-    """A constant as rule files write it: `20%`, `yes`, an element's name; text names a parameter."""
+    """A constant in the syntax of rule files: `20%`, `yes`, an element's name; text names a parameter."""
     match value:
         case str():
             return value
@@ -126,7 +126,7 @@ def show_value(ruleset: Ruleset, kind: Kind, value: Value | str) -> str:
             return show_offset(OCTANTS[int(value)])
         case "chance":
             percent = value * 100
-            # Floats of parameters are meant as the decimal they print as: 2% is not 2.0000000000000004%.
+            # Floats of parameters mean the decimal that they print as: 2% is not 2.0000000000000004%.
             return f"{percent:.10g}%" if isinstance(percent, float) else f"{show_number(percent)}%"
     return show_number(value)
 
@@ -136,7 +136,7 @@ def element_name(ruleset: Ruleset, number: int) -> str:
 
 
 def show_set(ruleset: Ruleset, ids: Iterable[int]) -> str:
-    """A set of elements, the shorter way round: `(a, b)`, or `any but (c)` for most of them."""
+    """A set of elements in its shorter form: `(a, b)`, or `any but (c)` for most of them."""
     chosen = frozenset(ids)
     everything = [element.id for element in ruleset.elements]
     if chosen.issuperset(everything) and everything:
@@ -158,24 +158,24 @@ def show_offset(offset: Offset) -> str:
 
 
 def show_expr(ruleset: Ruleset, expr: Expr) -> str:
-    """An expression of the model as one writes it in rules, with names for numbers."""
+    """An expression of the model in the syntax of rules, with names for numbers."""
     return _Printer(ruleset).expr(expr)
 
 
 def tint_text(item: Field) -> str:
-    """The tint of a field after a blank, or an empty string."""
+    """The tint of a field after a space, or an empty string."""
     tint = item.tint
     return f" tint {tint.color} full {tint.full} most {tint.most:g}" if tint else ""
 
 
 def ramp_text(element: Element) -> str:
-    """The color ramp of an element after a blank, or an empty string."""
+    """The color ramp of an element after a space, or an empty string."""
     ramp = element.ramp
     return f" {ramp.start} -> {ramp.end} by {ramp.field} {ramp.lo}..{ramp.hi}" if ramp else ""
 
 
 class _Printer:
-    """Prints one ruleset, and remembers its kernels to name and list them."""
+    """Prints one ruleset, and collects its kernels to name and list them."""
 
     def __init__(self, ruleset: Ruleset):
         self.ruleset = ruleset
@@ -222,7 +222,7 @@ class _Printer:
         return f"{item.name} {item.kind} at {item.at}{of} default {default}{own}{resets}{tint_text(item)}"
 
     def kernel_lines(self) -> list[str]:
-        """A line for each kernel that was printed: its name, and the weight of each neighbor."""
+        """A line for each printed kernel: its name, and the weight of each neighbor."""
         lines = []
         for kernel, name in self.kernels.items():
             weights = " ".join(f"({dy},{dx})={weight}" for dy, dx, weight in kernel.weights)
@@ -275,12 +275,12 @@ class _Printer:
     # Expressions
 
     def expr(self, expr: Expr, binding: int = 0) -> str:
-        """An expression, in parentheses if it binds less tightly than it must."""
+        """An expression, in parentheses if its precedence requires them."""
         text, level = self._expr(expr)
         return f"({text})" if level < binding else text
 
     def _expr(self, expr: Expr) -> tuple[str, int]:
-        """The text of an expression, and how tightly it binds."""
+        """The text of an expression, and its precedence."""
         rules, args = self.ruleset, expr.args
         row = OPERATIONS[expr.op]
         if row.sign:
@@ -295,7 +295,7 @@ class _Printer:
                 return show_value(rules, expr.kind, expr.value), _ATOM
             case "element":
                 return "element", _ATOM
-            case "draw":  # a stream may be called like anything else
+            case "draw":  # a stream may share its name with something else
                 return f"draw({expr.value})", _ATOM
             case "coordinate":
                 return "{} mod {}".format(*expr.value), 6
@@ -315,7 +315,7 @@ class _Printer:
         return str(expr.value), _ATOM
 
     def kernel(self, kernel: Kernel) -> str:
-        """The kernel's name, numbered if several share it, as copies under a symmetry do."""
+        """The kernel's name, numbered if several kernels share it, such as copies under a symmetry."""
         if kernel not in self.kernels:
             copies = sum(other.name == kernel.name for other in self.kernels)
             self.kernels[kernel] = f"{kernel.name}#{copies + 1}" if copies else kernel.name

@@ -1,7 +1,7 @@
 """The checked model of a ruleset, resolved, typed and unrolled. Frozen, printable, no torch, no NumPy.
 
-Everything discrete has a declared range; every chance and count is explicit. The reference interpreter runs these
-values directly, and `ir/lower.py` lowers them; neither looks at syntax again.
+Everything discrete has a declared range; every chance and count is explicit. The reference interpreter runs the model
+directly, and `ir/lower.py` lowers it; neither needs the syntax.
 """
 
 from __future__ import annotations
@@ -86,7 +86,7 @@ class Expr:
     span: Span | None = field(default=None, compare=False, repr=False)
 
     def walk(self) -> Iterator[Expr]:
-        """This expression and everything in it."""
+        """This expression and all its subexpressions."""
         yield self
         for arg in self.args:
             yield from arg.walk()
@@ -94,9 +94,9 @@ class Expr:
 
 @dataclass(frozen=True)
 class ColorRamp:
-    """An element's color by the value of a field: `start` up to `lo`, `end` from `hi`, between them in proportion.
+    """An element's color by the value of a field: `start` up to `lo`, `end` from `hi`, and interpolated between.
 
-    Each of red, green and blue is rounded to the nearest integer, halves up. `real`: the field's values are float32.
+    Red, green and blue are rounded to the nearest integer, halves up. `real`: the field's values are float32.
     """
 
     field: str
@@ -134,7 +134,7 @@ class Element:
 
 @dataclass(frozen=True)
 class Property:
-    """A constant of each element; `stored` has the ids whose cells may override it one at a time."""
+    """A constant of each element; `stored` has the ids whose cells may have their own value."""
 
     name: str
     kind: Kind
@@ -148,7 +148,7 @@ class Property:
 
 @dataclass(frozen=True)
 class Tint:
-    """The tint of cells by a vector field in pictures: toward `color`, by its length / `full`, at most by `most`."""
+    """The tint of cells in pictures by a vector field: toward `color`, by its length / `full`, at most `most`."""
 
     color: str
     full: int
@@ -180,7 +180,7 @@ class Field:
 
 @dataclass(frozen=True)
 class Stream:
-    """A source of random numbers. `ident` enters the hash; `bits` is the resolution of a draw."""
+    """A source of random numbers. `ident` is hashed; `bits` is the resolution of a draw."""
 
     name: str
     ident: int
@@ -200,7 +200,7 @@ class Param:
 
 @dataclass(frozen=True)
 class Kernel:
-    """Weights by offset, row by row from the top left. `wrap`: the grid wraps, else outside counts as nothing."""
+    """Weights by offset, row by row from the top left. `wrap`: the grid wraps; otherwise, it ends at its edges."""
 
     name: str
     weights: tuple[tuple[int, int, int], ...]
@@ -220,7 +220,7 @@ class Assign:
     op: str
     value: Expr
     mask: Expr
-    """Always true for an effect: it happens where its rule happens."""
+    """Always true for an effect, which applies where its rule fires."""
     span: Span = dataclasses.field(compare=False, repr=False)
 
     @property
@@ -242,7 +242,7 @@ class Transform:
 
 @dataclass(frozen=True)
 class Swap:
-    """Cells of the mask exchange what they hold with the neighbor `offset` away."""
+    """Cells of the mask exchange contents with the neighbor `offset` away."""
 
     mask: Expr
     offset: Offset
@@ -252,9 +252,9 @@ class Swap:
 
 @dataclass(frozen=True)
 class Move:
-    """Cells of the mask move what they hold to the neighbor `offset` away and leave a fresh element behind.
+    """Cells of the mask move their contents to the neighbor `offset` away and leave a fresh element behind.
 
-    `leaving` is None for cells that leave behind what that neighbor held: they trade places, also in rows.
+    `leaving` is None for cells that leave behind the neighbor's contents: they trade places, also in rows.
     """
 
     mask: Expr
@@ -286,7 +286,7 @@ def footprint(rule: Rule) -> tuple[Offset, ...]:
 
 @dataclass(frozen=True)
 class Let:
-    """A value fixed where it stands."""
+    """A value that is computed once, at its place in the pass."""
 
     name: str
     value: Expr
@@ -325,7 +325,7 @@ class Pass:
 
 
 def substeps(passes: Iterable[Pass]) -> Iterator[tuple[Pass, Moment]]:
-    """Every substep with its pass, in the order in which they run."""
+    """Every substep with its pass, in execution order."""
     for pass_ in passes:
         for moment in pass_.moments:
             yield pass_, moment
@@ -340,7 +340,7 @@ expected); () is what a fresh cell of its element has, None is anything."""
 class FieldGrid:
     """A field, or a property that rules assign, drawn cell by cell in rows from the top.
 
-    `everywhere`: one value stood for all cells; it counts in those whose element can have it.
+    `everywhere`: one value was given for all cells, and applies to those whose element can have it.
     """
 
     name: str
@@ -351,7 +351,7 @@ class FieldGrid:
 
 @dataclass(frozen=True)
 class Often:
-    """A test's claim: `after` holds in the end in the part `chance` of the cells where `before` held at the start."""
+    """A test's claim: of the cells where `before` held at the start, a fraction `chance` meets `after` in the end."""
 
     before: Expr
     after: Expr
@@ -373,18 +373,18 @@ class Example:
     span: Span = field(compare=False, repr=False)
     seed: int | None = None
     fields: tuple[FieldGrid, ...] = ()
-    """Values that the start world has beside its elements."""
+    """Values of fields in the start world."""
     expect_fields: tuple[FieldGrid, ...] = ()
     often: tuple[Often, ...] = ()
     params: tuple[tuple[str, float], ...] = ()
     """Values of parameters; all others have those of the rules."""
     scope: tuple[str, ...] = field(default=(), compare=False)
-    """The packs that it is about. With other packs added its result may differ."""
+    """The packs in its scope. With other packs added, its result may differ."""
 
 
 @dataclass(frozen=True)
 class Unchanging:
-    """Cells that hold one of these elements keep it permanently."""
+    """Cells with one of these elements keep it forever."""
 
     ids: frozenset[int]
 
@@ -393,7 +393,7 @@ class Unchanging:
 class Total:
     """The sum of an integer over all cells is ``constant``, ``never rises`` or ``never falls`` from step to step.
 
-    `ids` are the elements that are counted, if it is such a number; `value` is an int then too, 1 or 0.
+    For a count, `ids` are the counted elements, and `value` is an int, 1 or 0.
     """
 
     value: Expr
@@ -403,7 +403,7 @@ class Total:
 
 @dataclass(frozen=True)
 class Never:
-    """In no cell does the condition hold after `steps` steps in a row if it did not hold at the start."""
+    """If the condition holds in no cell at the start, it never holds in a cell after `steps` consecutive steps."""
 
     condition: Expr
     steps: int
@@ -418,7 +418,7 @@ class Local:
 
 @dataclass(frozen=True)
 class Symmetric:
-    """A step of a turned world gives the turned world. `turn` is ``mirrored`` or ``rotated``."""
+    """Stepping commutes with turning the world. `turn` is ``mirrored`` or ``rotated``."""
 
     turn: str
 
@@ -447,7 +447,7 @@ class Invariant:
     pack: str
     span: Span = field(compare=False, repr=False)
     scope: tuple[str, ...] = field(default=(), compare=False)
-    """The packs that it is about. With other packs added it may no longer hold."""
+    """The packs in its scope. With other packs added, it may no longer hold."""
 
 
 @dataclass(frozen=True)
@@ -462,7 +462,7 @@ class Declared:
 class MatrixChannel:
     """A channel of `World.matrix()`: whether a cell has the element `id`, or a field or property, or a component of it.
 
-    Without an id and a source it is always 0, for its pack is not loaded; so it is for an id without an element.
+    Without an id and a source (its pack is not loaded), or for an id without an element, it is always 0.
     """
 
     name: str
@@ -475,7 +475,7 @@ class MatrixChannel:
 class Ruleset:
     """A checked ruleset. `slots` is the number of ids, some of which may be vacant.
 
-    `name` says what is loaded: a ruleset, what is left out of it, what is added to it.
+    `name` names what is loaded: a ruleset, and the packs left out of it and added to it.
     """
 
     name: str = field(metadata=UNMEANING)
@@ -490,7 +490,7 @@ class Ruleset:
     passes: tuple[Pass, ...]
     matrix: tuple[MatrixChannel, ...]
     order: tuple[str, ...] = ()
-    """The names of all that a cell holds besides its element, as `model/composition/compose.py` orders it."""
+    """The names of all that a cell stores besides its element, in the order of `model/composition/compose.py`."""
     tests: tuple[Example, ...] = field(default=(), metadata=UNMEANING)
     invariants: tuple[Invariant, ...] = field(default=(), metadata=UNMEANING)
     side_multiple: int = field(default=1, metadata=UNMEANING)
@@ -499,7 +499,7 @@ class Ruleset:
     """The files that it was checked from."""
 
     def added_to(self, scope: tuple[str, ...]) -> tuple[str, ...]:
-        """The loaded packs that lie outside a scope, in load order."""
+        """The loaded packs outside a scope, in load order."""
         return tuple(pack for pack in self.packs if pack not in scope)
 
     def element(self, name: str) -> Element | None:
@@ -508,7 +508,7 @@ class Ruleset:
 
     @cached_property
     def text_key(self) -> str:
-        """A text that differs wherever anything of two rulesets differs, places in files included."""
+        """A text that differs if two rulesets differ in anything, including locations in files."""
         return fingerprint(replace(self, declared=None), whole=True)
 
     @property
@@ -524,6 +524,6 @@ class Ruleset:
         return next((f for f in self.fields if f.name == name), None)
 
     def with_params(self, values: dict[str, Value]) -> Ruleset:
-        """The same ruleset with other defaults; the values are checked by `definitions.set_params`."""
+        """The ruleset with other defaults of parameters, which `definitions.set_params` has checked."""
         params = tuple(replace(p, default=values.get(p.name, p.default)) for p in self.params)
         return replace(self, params=params)

@@ -1,6 +1,6 @@
-"""OGBench's Powderworld on powderdsl: the same environments and data sets, many worlds at once.
+"""OGBench's Powderworld on powderdsl: the same environments and datasets, with many worlds at once.
 
-`make_env_and_datasets` takes the place of `ogbench.make_env_and_datasets`. Importing this registers
+`make_env_and_datasets` replaces `ogbench.make_env_and_datasets`. Importing this registers
 ``powderworld-easy-v0``, ``powderworld-medium-v0`` and ``powderworld-hard-v0`` with Gymnasium, unless OGBench itself has;
 ``powderdsl/powderworld-easy-v0`` and so on are always ours.
 """

@@ -1,8 +1,8 @@
-"""Collecting data sets of scripted play, in OGBench's files. Options alone decide every byte of them.
+"""Collecting datasets of scripted play in OGBench's file format. Every byte depends only on the options.
 
-Scripts mix random blocks with filled worlds, lines and squares; no world is looked at. Their draws are hashes of the
-seed, the episode and the place in it. Episodes are played in parts, whose worlds are kept in files beside the data set
-until it is complete: what was interrupted continues there.
+Scripts mix random blocks with filled worlds, lines and squares, without observing worlds. Their draws are hashes of the
+seed, the episode and the position in it. Episodes are played in parts, whose worlds are stored in files next to the
+dataset until it is complete, so that an interrupted collection can be resumed.
 """
 
 from __future__ import annotations
@@ -30,10 +30,10 @@ Numbers = NDArray[np.int64]
 Place = tuple[int, int]
 Frames = NDArray[np.uint8]
 Progress = Callable[[float, int], None]
-"""Called with the number of episodes that are done, unfinished ones as fractions, and the number of all."""
+"""Called with the number of finished episodes, including fractions of unfinished ones, and the total number."""
 
 RANDOM = 0.5
-"""The chance that a random action comes before the next one of the current script."""
+"""The probability of a random action before the next action of the current script."""
 
 SCRIPT_DRAWS = 16
 """Draws for one script."""
@@ -45,18 +45,18 @@ PART = 64
 """Episodes of a part."""
 
 WRITTEN = 8
-"""Episodes whose rows are in memory at once."""
+"""Number of episodes whose rows are in memory at once."""
 
 COMPRESSION = 1
 """zlib's level: 6, its default, takes three times as long and saves little."""
 
 PLAYED = 0.6
-"""The share of an episode's work that is done once it has been played; the rest is compressing."""
+"""The share of an episode's work that is playing; the rest is compressing."""
 
 
 @dataclass(frozen=True)
 class Recipe:
-    """Everything that decides the bytes of one file: `count` episodes of `rows` rows from the number `first`."""
+    """Everything that determines the bytes of one file: `count` episodes of `rows` rows from number `first`."""
 
     level: str
     rules: str
@@ -67,7 +67,7 @@ class Recipe:
 
     @property
     def painted(self) -> int:
-        """Whole actions of an episode: worlds change so often."""
+        """Number of whole actions of an episode, which change its world."""
         return (self.rows - 1) // 3
 
     @property
@@ -77,7 +77,7 @@ class Recipe:
         return [every[at : at + PART] for at in range(0, self.count, PART)]
 
     def actions(self, level: Level, numbers: Numbers) -> NDArray[np.int16]:
-        """The whole actions of some episodes: int16 [count, n, 3]; the last may be cut off in its rows."""
+        """The whole actions of some episodes: int16 [count, n, 3]; the rows may end within the last one."""
         return play(level, self.seed, numbers, -(-self.rows // 3))
 
 
@@ -90,18 +90,19 @@ def collect(
     seed: int = 0,
     progress: Progress | None = None,
 ) -> list[Path]:
-    """Write ``powderworld-LEVEL-play-v0.npz`` and ``…-val.npz`` to a folder; what is there already is not made again.
+    """Write ``powderworld-LEVEL-play-v0.npz`` and ``…-val.npz`` to a folder; existing files are kept.
 
     Args:
-        episodes, validation: how many; the level's numbers by default, and a tenth if only `episodes` is given.
-        seed: decides the actions of each episode, and with them its worlds.
+        episodes, validation: numbers of episodes; by default the level's, or a tenth for validation if only `episodes`
+            is given.
+        seed: determines the actions of each episode, and thereby its worlds.
 
     Returns:
         the files.
 
     Raises:
-        CompileError: PD613 if something cannot be written, PD622 if another process writes there. ValueError: other data
-        of the same name is there.
+        CompileError: PD613 if something cannot be written, PD622 if another process writes there. ValueError: other
+            data of the same name exists.
     """
     level, place = program.level, Path(folder)
     train = level.play.episodes if episodes is None else episodes
@@ -175,7 +176,7 @@ def _observations(
     for numbers in recipe.parts:
         frames = _read_part(parts / f"{numbers[0]:010}.npz", recipe, program.level, len(numbers))
         if frames is None:
-            raise failure("PD613", f"cannot write the data set: {parts} was changed meanwhile")
+            raise failure("PD613", f"cannot write the dataset: {parts} was changed meanwhile")
         actions = recipe.actions(program.level, numbers)
         for at in range(0, len(numbers), WRITTEN):
             few = slice(at, at + WRITTEN)
@@ -208,7 +209,7 @@ def rows_of(program: LevelProgram, frames: Frames, actions: NDArray[np.int16], r
     for stage in range(3):
         at = pixels[:, stage::3]
         count = at.shape[1]
-        for channel in range(3):  # one at a time: a pixel's three colors are too short a row to copy
+        for channel in range(3):  # one at a time, since copying rows of three bytes is slow
             at[..., channel] = pictures[:, :count, :, channel]
             if stage == 1:
                 at[..., 3 + channel] = chosen[:, :count, None, channel]
@@ -245,7 +246,7 @@ def play(level: Level, seed: int, episodes: Numbers, count: int) -> NDArray[np.i
 
 
 def scripted(level: Level, seed: int, episode: int) -> Iterator[tuple[int, int, int]]:
-    """The scripts of an episode without end, one after the other: (element, x, y)."""
+    """Endless scripts of an episode, one after another: (element, x, y)."""
     number = 0
     while True:
         drawn = keyed(([seed], [episode], [number]), "ogbench script", SCRIPT_DRAWS)[0].tolist()
@@ -257,7 +258,7 @@ def scripted(level: Level, seed: int, episode: int) -> Iterator[tuple[int, int, 
 
 
 def _fill(places: int, drawn: list[float]) -> list[Place]:
-    """All places, row by row; mirrored in x, in y, and with x and y exchanged, each with probability ½."""
+    """All places, row by row; with probability ½ each, mirrored in x, mirrored in y, and with x and y exchanged."""
     mirror_x, mirror_y, exchange = (number < 0.5 for number in drawn[:3])
     last = places - 1
     corners = [
@@ -290,4 +291,4 @@ def _square(places: int, drawn: list[float]) -> list[Place]:
 
 
 SCRIPTS = (_fill, *[_line] * 3, *[_square] * 3)
-"""Scripts, as often as they are drawn."""
+"""Scripts, repeated by their relative frequency."""

@@ -1,4 +1,4 @@
-"""OGBench's environment, with its spaces, options, infos and success: one world of a level, or many in one batch."""
+"""OGBench's environment, with its spaces, options and infos: one world of a level, or many in one batch."""
 
 from __future__ import annotations
 
@@ -36,10 +36,10 @@ class EnvOptions:
 
     Args:
         mode: ``task``, or ``data_collection``: no goals and no rewards.
-        seed: decides goals and episodes, until `reset` is given another one.
-        randomness: ``counter``: a goal depends on the seed and its task alone, and episode n of a seed is the same
-            anywhere. ``ogbench``: draws from a `numpy.random.RandomState` of the environment's own, in OGBench's order:
-            `reset` with a seed plays what OGBench plays after `numpy.random.seed` with it.
+        seed: determines goals and episodes, until `reset` gets another one.
+        randomness: ``counter``: a goal depends only on the seed and its task, and episode n of a seed is the same
+            anywhere. ``ogbench``: draws from the environment's own `numpy.random.RandomState` in OGBench's order, so
+            that `reset` with a seed plays the same as OGBench after `numpy.random.seed`.
         render_mode: None or ``rgb_array``. width, height: of what `render` returns.
         backend, device, threads: those of `powderdsl.compile`; ``ogbench`` runs on ``torch``.
 
@@ -64,7 +64,7 @@ class EnvOptions:
             raise ValueError(f"render_mode is None or rgb_array; found {self.render_mode!r}")
 
     def program(self, level: str | Path | Level | LevelProgram) -> LevelProgram:
-        """The program of a level; environments of one process share it."""
+        """The program of a level, shared by environments of a process."""
         if isinstance(level, LevelProgram):
             return level
         return _program(
@@ -76,7 +76,7 @@ class EnvOptions:
         )
 
     def picture(self, observation: Array) -> Array:
-        """The world's part of an observation, by its nearest pixels: uint8 [height, width, 3]."""
+        """The world's part of an observation, scaled to the nearest pixels: uint8 [height, width, 3]."""
         rows = np.arange(self.height) * observation.shape[0] // self.height
         columns = np.arange(self.width) * observation.shape[1] // self.width
         return np.ascontiguousarray(observation[rows][:, columns, :3])
@@ -86,7 +86,7 @@ _program = lru_cache(maxsize=16)(LevelProgram)
 
 
 class _Face:
-    """The base of environments that show `Episodes` to Gymnasium: their spaces and pictures."""
+    """The base of Gymnasium environments that wrap `Episodes`: spaces and pictures."""
 
     metadata: dict[str, Any]
     episodes: Episodes
@@ -102,7 +102,7 @@ class _Face:
         self._actions = Discrete(self.level.actions)
 
     def _task(self, options: Mapping[str, Any]) -> int | GoalTask | None:
-        """The task that options of `reset` name, if there are tasks."""
+        """The task named by options of `reset`, if there are tasks."""
         return task_of(self.level, options) if self.episodes.mode == "task" else None
 
     def _observations(self) -> Array:
@@ -116,7 +116,7 @@ class PowderworldEnv(_Face, gymnasium.Env[Array, Any], EzPickle):
     """OGBench's Powderworld: an action chooses an element, the next x, the next y; then a step runs and a block is painted.
 
     Observations are uint8 [H, W, 6]: the world's picture and the action frame. Actions are integers below
-    ``action_space.n``. The reward is 1 while the world matches the goal, else 0.
+    ``action_space.n``. The reward is 1 while the world matches the goal, and 0 otherwise.
 
     Args:
         level: name of a shipped level, path of a level's file, a `Level`, or a `LevelProgram` to share.
@@ -137,7 +137,7 @@ class PowderworldEnv(_Face, gymnasium.Env[Array, Any], EzPickle):
             for task in self.level.tasks
         ]
         self.cur_task_id: int | None = None
-        """The task of the episode, from 1; None before the first, and for a task that was given as `task_info`."""
+        """The task of the episode, from 1; None before the first, and for a task passed as `task_info`."""
         self.cur_task_info: dict[str, Any] | None = None
 
     @property
@@ -151,12 +151,14 @@ class PowderworldEnv(_Face, gymnasium.Env[Array, Any], EzPickle):
         """Begin an episode.
 
         Args:
-            seed: a new seed, of which this is the first episode. Without one, the next episode of the old seed begins.
+            seed: a new seed, of which this is the first episode. By default, the next episode of the current seed
+                begins.
             options: ``task_id``, from 1; or ``task_info``, with ``action_seq``, a list of (element, x, y), and ``tol``;
-                without them a task is drawn. ``render_goal``: adds ``goal_rendered``, uint8 [height, width, 3].
+                by default, a task is drawn. ``render_goal``: adds ``goal_rendered``, uint8 [height, width, 3].
 
         Returns:
-            The observation, and infos: ``goal``, uint8 [H, W, 6], the goal as an observation; no infos in data collection.
+            The observation, and infos: ``goal``, uint8 [H, W, 6], the goal as an observation. No infos in data
+            collection.
 
         Raises:
             KeyError: an unknown option.
@@ -195,7 +197,7 @@ class PowderworldEnv(_Face, gymnasium.Env[Array, Any], EzPickle):
     # For scripts that choose whole actions
 
     def sample_semantic_action(self) -> tuple[str, int, int]:
-        """Draw a whole action, all equally likely, from the seed, the episode and its step: the element's name, x, y."""
+        """Draw a uniformly random whole action from the seed, the episode and its step: the element's name, x, y."""
         at = self.episodes
         key = (at.seeds, at.episode.clip(0), at.elapsed)
         drawn = [float(keyed(key, f"{what} sample", 1)[0, 0]) for what in FIRST]
@@ -203,11 +205,11 @@ class PowderworldEnv(_Face, gymnasium.Env[Array, Any], EzPickle):
         return self.level.elements[element], x, y
 
     def semantic_action_to_action(self, elem_name: str, x: int, y: int) -> int:
-        """Return the part of a whole action that `step` takes at the present stage."""
+        """Return the part of a whole action that `step` takes at the current stage."""
         return (self.level.elements.index(str(elem_name)), x, y)[self.episodes.stage[0]]
 
     def sample_action(self) -> int:
-        """Draw a valid action for the present stage, all equally likely."""
+        """Draw a uniformly random valid action for the current stage."""
         return self.semantic_action_to_action(*self.sample_semantic_action())
 
 
@@ -217,7 +219,7 @@ class PowderworldVectorEnv(_Face, VectorEnv[Any, Any, Any]):
     Args:
         level: as in `PowderworldEnv`.
         num_envs: the number of worlds, B.
-        max_episode_steps: truncates episodes; the level's number by default.
+        max_episode_steps: truncate episodes; by default, at the level's number.
         autoreset_mode: one of Gymnasium's, or its name.
         options: those of `EnvOptions`.
 
@@ -250,15 +252,15 @@ class PowderworldVectorEnv(_Face, VectorEnv[Any, Any, Any]):
         """Begin all episodes, or those of a mask.
 
         Args:
-            seed: s gives environment i the seed s + i; a list gives each its own, or None.
+            seed: an integer s gives environment i the seed s + i; a list has a seed or None for each.
             options: ``task_id``: a number from 1, or one for each environment; ``task_info``: as in `PowderworldEnv`.
-                They hold for these episodes; later ones draw a task. ``reset_mask``: bool [B].
+                They apply only to these episodes; later ones draw a task. ``reset_mask``: bool [B].
 
         Returns:
             Observations uint8 [B, H, W, 6]; infos: ``goal``, of the same shape, and ``task_id``, int64 [B].
 
         Raises:
-            KeyError: an unknown option. Nothing has changed then, nor in the other cases.
+            KeyError: an unknown option. After an error, nothing has changed.
             TypeError: a seed or an option has the wrong type.
             ValueError: a seed or an option is out of range, or has the wrong length.
         """
@@ -287,7 +289,7 @@ class PowderworldVectorEnv(_Face, VectorEnv[Any, Any, Any]):
 
         Returns:
             Observations uint8 [B, H, W, 6]; reward float64 [B]; terminated and truncated, bool [B]; infos: ``success``,
-            float64 [B]; where an episode began, its ``goal`` and ``task_id``, as `reset` gives them; under SAME_STEP
+            float64 [B]; where an episode began, its ``goal`` and ``task_id``, as in `reset`; under SAME_STEP
             ``final_obs`` and ``final_info`` too.
 
         Raises:

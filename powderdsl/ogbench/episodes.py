@@ -1,6 +1,6 @@
-"""The worlds of a level, ready to run, and many episodes of it, step by step: stages, invalid actions, goals and success.
+"""The executable worlds of a level, and batches of its episodes: stages, invalid actions, goals and success.
 
-Environments are faces of this.
+Environments wrap this.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ Numbers = NDArray[np.int64]
 
 
 class _WithoutSnap(Simulator):
-    """A simulator on torch that keeps every magnitude of float fields."""
+    """A simulator on torch that does not flush small floats to zero."""
 
     def __init__(self, ruleset: Ruleset, device: str | torch.device):
         super().__init__(ruleset, "torch", device)
@@ -46,8 +46,8 @@ class LevelProgram:
     Args:
         level: from `find_level`.
         backend, device, threads: those of `powderdsl.compile`.
-        as_ogbench: round as OGBench does, on the backend ``torch``: the level's `rounded` rules, draws of 32 bits, and
-            no magnitude is too small to keep.
+        as_ogbench: round as OGBench does, on the backend ``torch``: use the level's `rounded` rules and 32-bit draws,
+            and do not flush small floats to zero.
     """
 
     def __init__(
@@ -70,7 +70,7 @@ class LevelProgram:
         self.device = self.simulator.device
         self.streams = tuple(stream.name for stream in ruleset.streams)
         self.ids = np.array([_number(ruleset, name) for name in level.elements], dtype=np.int64)
-        """The ids of what agents paint, in the order of actions."""
+        """The ids of the elements that agents paint, in the order of actions."""
         fill, frame = _number(ruleset, level.fill), _number(ruleset, level.frame)
         start = torch.full((level.side, level.side), fill, dtype=torch.uint8, device=self.device)
         start[0], start[-1], start[:, 0], start[:, -1] = frame, frame, frame, frame
@@ -78,10 +78,10 @@ class LevelProgram:
         first = torch.arange(level.places, device=self.device) * level.grid
         edges = torch.stack([first, first + level.brush], 1).clamp(1, level.side - 1)
         self.blocks = Blocks(self.simulator, (level.side, level.side), (edges, edges))
-        """The blocks of all places, without the frame."""
+        """The blocks of all positions, without the frame."""
         self._covers = (edges[:, 1] > edges[:, 0]).cpu().numpy()
         self.paints = torch.from_numpy(palette(ruleset.elements)[self.ids, :3]).to(self.device)
-        """The colors of what agents paint: uint8 [n, 3]."""
+        """The colors of the elements that agents paint: uint8 [n, 3]."""
         line, begins = np.arange(level.side), first.cpu().numpy()[:, None]
         inside = (line >= begins) & (line < begins + level.brush)
         # Lines of frames, uint8 [n + 1, 6 W], behind one for what is not chosen yet: 255 where an x is lit; colors.
@@ -96,12 +96,13 @@ class LevelProgram:
     def act(
         self, world: World, painted: Numbers, planes: NDArray[np.float64] | None = None, *, reuse: bool = True
     ) -> World:
-        """One step of the rules, then a block painted in each world, except where the frame is.
+        """Run one step of the rules, then paint a block in each world, except on the frame.
 
         Args:
             painted: int64 [B, 3]: the index of the element, x and y.
-            planes: [streams, B, H, W] in [0, 1): draws to use instead of our own, in the order of the rules' streams.
-            reuse: the memory of `world` may be written to, and it must not be used afterwards.
+            planes: [streams, B, H, W] in [0, 1): draws to use instead of random numbers, in the order of the rules'
+                streams.
+            reuse: overwrite the memory of `world`, which must not be used afterwards.
         """
         draws: Mapping[str, Any] | None = None
         if planes is not None:
@@ -114,7 +115,7 @@ class LevelProgram:
         if not packed:
             ids, x, y, where = (torch.from_numpy(part).to(self.device) for part in (ids, x, y, where))
         values = self.blocks.fresh_cells(stepped.state, ids)
-        reuse = reuse or packed  # a step makes a packed state of its own
+        reuse = reuse or packed  # a step creates its own packed state
         cells = self.blocks.cells(stepped.state, y, x)
         return stepped.with_state(self.blocks.filled(stepped.state, cells, where, values, reuse=reuse))
 
@@ -124,7 +125,7 @@ class LevelProgram:
         return (colors & self._lit.take((1 + x) * (stage > 1), 0))[:, None]
 
     def errors(self, ids: Tensor, goals: Tensor) -> Numbers:
-        """Cells of goals, uint8 [B, H, W], whose element is neither there in `ids` nor beside it: int64 [B]."""
+        """Number of cells of goals, uint8 [B, H, W], without their element there or next to it in `ids`: int64 [B]."""
         matched = ids == goals
         for axis in (1, 2):
             for by in (1, -1):
@@ -142,19 +143,19 @@ def _number(ruleset: Ruleset, name: str) -> int:
 
 
 MODES = ("task", "data_collection")
-"""``task``: goals, rewards, and a first painted block. ``data_collection``: the worlds alone."""
+"""``task``: goals, rewards, and a first painted block. ``data_collection``: only the worlds."""
 
 GOALS = 0xFFFFFFFF
-"""The index of worlds in which goals are played; episodes have the indices 0, 1, …"""
+"""The index of worlds for computing goals; episodes have the indices 0, 1, …"""
 
 MAX_GOALS = 1 << 13
-"""Goals that are kept."""
+"""Maximum number of cached goals."""
 
 RANDOMNESS = ("counter", "ogbench")
 """``counter``: hashes of the seed, the episode, the step and what is drawn. ``ogbench``: a generator for each environment."""
 
 FIRST = ("ogbench element", "ogbench x", "ogbench y")
-"""What is drawn at each stage of a first action."""
+"""The draws of each stage of a first action."""
 
 
 def keyed(parts: Sequence[Any], what: str, count: int) -> NDArray[np.float64]:
@@ -173,10 +174,10 @@ def keyed(parts: Sequence[Any], what: str, count: int) -> NDArray[np.float64]:
 
 
 class Draws:
-    """Random numbers of environments `which`, int64 [n]: hashes of their seeds, the number of the episode and its step."""
+    """Random numbers of environments `which`, int64 [n]: hashes of their seeds, episode numbers and steps."""
 
     fixes_goals = True
-    """Whether a goal depends on the seed and its task alone."""
+    """True if a goal depends only on the seed and its task."""
 
     def __init__(self, seeds: Numbers):
         self._seeds = seeds
@@ -191,7 +192,7 @@ class Draws:
         return None
 
     def seed(self, which: int, seed: int) -> None:
-        """Start the draws of an environment again, from a seed."""
+        """Restart the draws of an environment from a seed."""
         self._seeds[which] = seed
 
 
@@ -213,13 +214,13 @@ class LegacyDraws(Draws):
     def planes(self, which: Numbers) -> NDArray[np.float64]:
         shape = (self._streams, self._side, self._side)
         drawn = np.stack([self._states[number].rand(*shape) for number in which], 1)
-        # In single precision, as the engine has them; what rounds to 1 stays below.
+        # In single precision, as in the engine; numbers that would round to 1 stay below.
         single = drawn.astype(np.float32).astype(np.float64)
         return np.minimum(single, np.nextafter(1.0, 0.0))
 
 
 class Goal(NamedTuple):
-    """A world to reach: ids uint8 [H, W] and picture uint8 [H, W, 3]."""
+    """A goal world: ids uint8 [H, W] and picture uint8 [H, W, 3]."""
 
     ids: Tensor
     picture: Tensor
@@ -234,10 +235,10 @@ class _Rows(Recycled):
 
 
 class Episodes:
-    """A batch of episodes of one level. Environment i has the seed `seeds`[i], and its first episode the number 0.
+    """A batch of episodes of one level. Environment i has the seed `seeds`[i]; its first episode has number 0.
 
     Args:
-        program: from the same level; one made `as_ogbench` if `randomness` is ``ogbench``.
+        program: a program of the level, created with `as_ogbench` if `randomness` is ``ogbench``.
         seeds: int64 [B], of 0 or more.
         randomness: one of RANDOMNESS, or other draws. mode: one of MODES.
     """
@@ -262,18 +263,18 @@ class Episodes:
         self.episode = np.full(batch, -1, dtype=np.int64)
         """The number of each environment's episode."""
         self.stage = np.zeros(batch, dtype=np.int64)
-        """What the next action chooses: 0 the element, 1 x, 2 y."""
+        """The choice of the next action: 0 the element, 1 x, 2 y."""
         self.elapsed = np.zeros(batch, dtype=np.int64)
         """Environment steps of each episode."""
         self.errors = np.zeros(batch, dtype=np.int64)
-        """Cells of the goal without a match in the world."""
+        """Number of cells of the goal without a match in the world."""
         self.tolerance = np.zeros(batch, dtype=np.int64)
         self.task_number = np.zeros(batch, dtype=np.int64)
-        """The task of each episode, from 1; 0 if it was given from outside."""
+        """The task of each episode, from 1; 0 for a custom task."""
         self._chosen = np.zeros((batch, 3), dtype=np.int64)
         self.world: World | None = None
         self._pictures = torch.zeros(batch, side, side, 6, dtype=torch.uint8, device=device)
-        """What observations show, without action frames."""
+        """The worlds' pictures, without action frames."""
         self._memory: list[_Rows] = []
         """Of observations."""
         self.goal_ids = torch.zeros(batch, side, side, dtype=torch.uint8, device=device)
@@ -291,8 +292,8 @@ class Episodes:
         """Begin the next episodes of environments `which`, int64 [n]; the first call begins all.
 
         Args:
-            tasks: for each the number of a task, from 1, a task, or None to draw one.
-            seeds: for each a new seed, of which this is episode 0, or None.
+            tasks: for each, the number of a task, from 1, a custom task, or None to draw one.
+            seeds: for each, a new seed, of which this is episode 0, or None.
         """
         for place, seed in zip(which, seeds or (), strict=seeds is not None):
             if seed is not None:
@@ -335,7 +336,7 @@ class Episodes:
         self.tolerance[which] = [task.tolerance for task in tasks]
 
     def play_goals(self, which: Numbers, tasks: Sequence[GoalTask]) -> list[Goal]:
-        """The goals that tasks lead to, one for each of environments `which`, int64 [n]: their actions from the start."""
+        """The goals of tasks, one for each of environments `which`, int64 [n], computed by playing their actions."""
         goals: dict[int, Goal] = {}
         if not tasks:
             return []
@@ -358,9 +359,9 @@ class Episodes:
     # Stepping
 
     def step(self, actions: Numbers, active: NDArray[np.bool_] | None = None) -> NDArray[np.bool_]:
-        """One environment step of the episodes where `active`, bool [B], is set (None: of all).
+        """Take one environment step in the episodes where `active`, bool [B], is set (None: all).
 
-        Of actions, int64 [B], one that is not valid at its stage is replaced by a random valid one. Returns success, bool
+        Actions, int64 [B], that are not valid at their stage are replaced by random valid ones. Returns success, bool
         [B]: whether the worlds match their goals now.
         """
         part, which = self._world, np.arange(self.count) if active is None else np.flatnonzero(active)
@@ -396,7 +397,7 @@ class Episodes:
         return self.world
 
     def _put(self, which: Numbers, part: World) -> None:
-        """Take up new states of the worlds `which`: what they show, and their errors."""
+        """Update the pictures and errors of the worlds `which`."""
         if len(which) == self.count:
             self.world, goals = part, self.goal_ids
             part.sim.observer.rgb(part.state, self._pictures, size=6)
@@ -414,7 +415,7 @@ class Episodes:
     # Showing
 
     def observations(self) -> Tensor:
-        """uint8 [B, H, W, 6]: the worlds' pictures, then the action frames. It is never overwritten.
+        """Observations uint8 [B, H, W, 6]: the worlds' pictures, then the action frames. They are never overwritten.
 
         Raises ResetNeeded before the first episode.
         """
@@ -435,14 +436,14 @@ class Episodes:
 
 
 def task_of(level: Level, options: Mapping[str, Any]) -> int | GoalTask | None:
-    """The task that options of `reset` name: a number from 1, a custom task, or None.
+    """The task named by options of `reset`: a number from 1, a custom task, or None.
 
-    Raises TypeError or ValueError if they name none that the level has.
+    Raises TypeError or ValueError if the level does not have it.
     """
     number, info = options.get("task_id"), options.get("task_info")
     if info is not None:
         if number is not None:
-            raise ValueError("give `task_id` or `task_info`, not both")
+            raise ValueError("pass `task_id` or `task_info`, not both")
         task = read_task(info)
         level.numbers(task)
         return task
@@ -451,5 +452,5 @@ def task_of(level: Level, options: Mapping[str, Any]) -> int | GoalTask | None:
     if not hasattr(number, "__index__") or isinstance(number, bool):
         raise TypeError(f"task_id must be an integer, found {number!r}")
     if not 1 <= number <= len(level.tasks):
-        raise ValueError(f"task_id must lie in 1..{len(level.tasks)}, found {number}")
+        raise ValueError(f"task_id must be in 1..{len(level.tasks)}, found {number}")
     return int(number)

@@ -1,6 +1,6 @@
-"""Levels: which elements an agent paints, how, and the goals that it is given; and their data sets.
+"""Levels: the elements that an agent paints, the goals, and their datasets.
 
-Levels are JSON files, shipped ones in `levels/`.
+Levels are JSON files; shipped ones are in `levels/`.
 """
 
 from __future__ import annotations
@@ -26,14 +26,14 @@ MAX_BYTES = 1 << 22
 MAX_SIDE = 512
 """Rows, and columns, of a level's worlds."""
 FEWEST_ACTIONS = 8
-"""Action spaces are never smaller."""
+"""Minimum size of an action space."""
 
 Count = Annotated[int, Limits(1, 1 << 30)]
 Cells = Annotated[int, Limits(0, 1 << 30)]
 
 
 class Painted(NamedTuple):
-    """One painted block: the element's name, and its place."""
+    """One painted block: the element's name and the position."""
 
     element: str
     x: int
@@ -42,7 +42,7 @@ class Painted(NamedTuple):
 
 @dataclass(frozen=True)
 class GoalTask:
-    """A goal: the world that its actions lead to, and how far from it an episode still succeeds.
+    """A goal: the world that its actions lead to, and the tolerance for success.
 
     An episode succeeds while fewer than `tolerance` cells of the goal have no match in the world.
     """
@@ -54,7 +54,7 @@ class GoalTask:
 
 @dataclass(frozen=True)
 class TaskInfo:
-    """A task as `reset` takes it in ``options["task_info"]``."""
+    """A task as in ``options["task_info"]`` of `reset`."""
 
     action_seq: tuple[Painted, ...]
     tol: Cells
@@ -63,7 +63,7 @@ class TaskInfo:
 
 @dataclass(frozen=True)
 class Play:
-    """The sizes of a level's data sets: episodes for training and validation, and rows of each."""
+    """The sizes of a level's datasets: numbers of episodes for training and validation, and rows per episode."""
 
     episodes: Count
     validation: Count
@@ -74,14 +74,14 @@ class Play:
 class Level:
     """Square worlds of `side` cells, `fill` with a `frame` around it, in which agents paint one of `elements`.
 
-    Place x, y is the block of `brush` × `brush` cells whose first column is `grid` · x and first row `grid` · y.
+    Position x, y is the block of `brush` × `brush` cells whose first column is `grid` · x and first row `grid` · y.
     An episode has at most `steps` environment steps.
     """
 
     name: str
     rules: str
     rounded: str
-    """The same rules, with floats rounded as in OGBench."""
+    """The same rules with floats rounded as in OGBench."""
     side: Annotated[int, Limits(4, MAX_SIDE)]
     fill: str
     frame: str
@@ -107,7 +107,7 @@ class Level:
         return self.places if stage else len(self.elements)
 
     def numbers(self, task: GoalTask) -> list[tuple[int, int, int]]:
-        """A task's actions as (index of the element, x, y). Raises ValueError for what the level does not have."""
+        """A task's actions as (index of the element, x, y). Raises ValueError for those outside the level."""
         triples = []
         for at, (element, x, y) in enumerate(task.actions):
             if element not in self.elements:
@@ -123,13 +123,13 @@ class Level:
 
 
 def shipped_levels() -> list[str]:
-    """Names of the levels that come with powderdsl, by the number of their elements."""
+    """Names of the shipped levels, by the number of their elements."""
     levels = [read_level(path) for path in sorted(FOLDER.glob("*.json"))]
     return [level.name for level in sorted(levels, key=lambda level: len(level.elements))]
 
 
 def find_level(level: str | Path | Level) -> Level:
-    """A level by name, or from a file. Raises ValueError, which says what is wrong; OSError: the file cannot be read."""
+    """A level by name, or from a file. Raises ValueError for an invalid level, OSError if the file cannot be read."""
     if isinstance(level, Level):
         return level
     if isinstance(level, Path) or is_path(level) or level.lower().endswith(".json"):
@@ -142,7 +142,7 @@ def find_level(level: str | Path | Level) -> Level:
 
 
 def read_level(path: Path) -> Level:
-    """A level's file. Raises ValueError, which says what is wrong; OSError: it cannot be read."""
+    """Read a level's file. Raises ValueError for an invalid level, OSError if it cannot be read."""
     try:
         level = checked_record(Level, parse_json(read_bytes(path, MAX_BYTES)))
         if max(level.brush, level.grid) > level.side:
@@ -160,15 +160,15 @@ def read_task(info: Any) -> GoalTask:
     return GoalTask(record.task_name, record.tol, record.action_seq)
 
 
-# Data sets: files of flat rows, and the environments that they belong to
+# Datasets: files of flat rows, and their environments
 
 DEFAULT_DATASET_DIR = "~/.ogbench/data"
-"""Where OGBench keeps its data sets, and where they are looked for."""
+"""OGBench's folder of datasets, where they are looked up."""
 
 FAMILY, VERSION = "powderworld", "v0"
 
 ROWS = ("observations", "actions", "terminals")
-"""The arrays of a file; rows of all episodes, one after the other."""
+"""The arrays of a file, with the rows of all episodes, one after another."""
 
 Dataset = dict[str, NDArray[Any]]
 
@@ -184,15 +184,15 @@ def make_env_and_datasets(
     add_info: bool = False,
     **env_kwargs: Any,
 ) -> Any:
-    """Make an environment and load a data set, as `ogbench.make_env_and_datasets` does. Nothing is downloaded.
+    """Create an environment and load a dataset, as `ogbench.make_env_and_datasets` does, but without downloading.
 
     Args:
         dataset_name: ``powderworld-easy-play-v0``, also ``medium`` and ``hard``.
-        dataset_dir: the folder of ``NAME.npz`` and ``NAME-val.npz``, which `powderdsl ogbench` writes.
+        dataset_dir: the folder of ``NAME.npz`` and ``NAME-val.npz``, as written by `powderdsl ogbench`.
         dataset_path: path of the first file; the second is expected in the same folder.
-        compact_dataset: False: transitions with ``next_observations``. True: all rows, and ``valids``.
-        env_only: load no data.
-        dataset_only: make no environment; `env_only` takes precedence.
+        compact_dataset: if False, transitions with ``next_observations``; if True, all rows, and ``valids``.
+        env_only: do not load data.
+        dataset_only: do not create an environment; `env_only` takes precedence.
         cur_env: accepted as by OGBench, and ignored.
         add_info: accepted as by OGBench, and ignored.
         env_kwargs: those of `PowderworldEnv`, and `max_episode_steps`.
@@ -202,14 +202,14 @@ def make_env_and_datasets(
         arrays by name, see `load_dataset`: observations uint8, actions int32, the others float32.
 
     Raises:
-        ValueError: an unknown name, or a file that is not such a data set.
+        ValueError: an unknown name, or a file that is not such a dataset.
         FileNotFoundError: there is no such file.
     """
     levels = shipped_levels()
     named = re.fullmatch(rf"{FAMILY}-({'|'.join(levels)})-[^-]+-{VERSION}", dataset_name)
     if named is None:
         known = [f"{FAMILY}-{name}-play-{VERSION}" for name in levels]
-        message = f"no data set named {dataset_name!r}"
+        message = f"no dataset named {dataset_name!r}"
         raise ValueError(with_suggestion(message, dataset_name, known, "data sets"))
     level = named[1]
     env = None
@@ -239,7 +239,7 @@ def load_dataset(
     compact_dataset: bool = False,
     add_info: bool = False,
 ) -> Dataset:
-    """Load a file of successive episodes, whose last rows are marked in `terminals`, as arrays by name.
+    """Load a file of successive episodes as arrays by name; `terminals` marks their last rows.
 
     Args:
         dataset_path: path of the file, .npz.
@@ -255,7 +255,7 @@ def load_dataset(
         `action_dtype` [N]; ``terminals`` and, if compact, ``valids``, float32 [N].
 
     Raises:
-        ValueError: the file is not such a data set; the text says why.
+        ValueError: the file is not such a dataset; the text gives the reason.
         OSError: it cannot be read.
     """
     path = Path(dataset_path)
@@ -269,15 +269,15 @@ def load_dataset(
                 shapes.append(head.shape[0])
             if len(set(shapes)) > 1:
                 raise BadArchive(f"its arrays have different numbers of rows: {shapes}")
-        # NumPy reads into memory that may be written to, as learners expect; what it reads has been checked above.
+        # NumPy reads into writable memory, as learners expect; the contents have been checked above.
         with np.load(path, allow_pickle=False) as file:
             observations, actions, ends = (file[name] for name in ROWS)
     except BadArchive as error:
-        raise ValueError(f"{path} is not a data set of OGBench's: {error}") from None
+        raise ValueError(f"{path} is not a dataset of OGBench: {error}") from None
     last = ends.astype(bool)
     if not len(last) or not last[-1] or last[0] or (last[1:] & last[:-1]).any():
         raise ValueError(
-            f"{path} is not a data set of OGBench's: `terminals` does not end episodes of at least two rows"
+            f"{path} is not a dataset of OGBench: `terminals` does not end episodes of at least two rows"
         )
     before = np.append(last[1:], False)
     observations = observations.astype(ob_dtype, copy=False)

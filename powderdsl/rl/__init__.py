@@ -1,6 +1,6 @@
-"""Training agents on tasks: PPO of Stable-Baselines3's, with runs that outlive a kill, and what comes after.
+"""Training agents on tasks with Stable-Baselines3's PPO, in runs that resume after a kill; evaluation and videos.
 
-`train` makes a run; `evaluate` compares its policy with others; `load_policy` gives the policy for use with tensors.
+`train` creates a run; `evaluate` compares its policy with others; `load_policy` returns the policy for use on tensors.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The settings of a training run: one frozen, checked value that JSON can hold. Needs no torch."""
+"""The settings of a training run, as one frozen, checked value that converts to JSON. Does not need torch."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ if TYPE_CHECKING:
 
 OBSERVATIONS = ("compact", "ids", "matrix", "laws")
 USUAL_OBSERVATION = MappingProxyType({"paper": "compact", "small": "ids", "fcn": "ids"})
-"""The networks, and the observation that each takes unless another is given."""
+"""The networks, and the default observation of each."""
 
 POLICIES = ("trained", "expert", "random", "nothing")
-"""Policies that are compared. Only runs have a trained one, only some tasks an expert."""
+"""Policies to compare. Only runs have a trained one, and only some tasks an expert."""
 BASELINES = ("random", "nothing")
-"""Policies that others are compared with in the same worlds."""
+"""Baselines, which others are compared with in the same worlds."""
 
 
 @dataclass(frozen=True)
@@ -31,63 +31,61 @@ class TrainConfig:
 
     task: str
     """A shipped task's name, or a file's path."""
-    split: str = setting("train", "Split: which worlds.  [default: train]", form="a name")
+    split: str = setting("train", "Split: the set of worlds.  [default: train]", form="a name")
     knobs: Mapping[str, int] = setting(dict)
     params: Mapping[str, Any] = setting(dict)
     """Parameters of the rules: numbers, or text such as ``5%``."""
     packs: tuple[str, ...] = setting(())
-    """Packs, by name or file, that are added to the task's rules."""
-    slots: int = setting(0, "Room for this many elements, for packs that come later.", 0, 256)
+    """Packs to add to the task's rules, by name or file."""
+    slots: int = setting(0, "Number of element slots, to leave room for packs added later.", 0, 256)
     curriculum: str = setting(
         "uniform",
-        "How to choose training worlds: evenly, or by prioritized level replay.",
+        "Choice of training worlds: uniform, or prioritized level replay.",
         choices=("uniform", "prioritized"),
     )
-    worlds: int = setting(1_000_000, "How many worlds there are to draw from.", 1, 2**62)
-    rulesets: int = setting(0, "Use only the first rulesets of the split, this many; 0: all.", 0, 4096)
+    worlds: int = setting(1_000_000, "Number of worlds to draw from.", 1, 2**62)
+    rulesets: int = setting(0, "Use only the first N rulesets of the split; 0: all.", 0, 4096)
     observation: str = setting("compact", "Observation of the network.", choices=OBSERVATIONS)
     network: str = setting(
-        "paper", "The paper's, a small one, or a fully convolutional one.", choices=tuple(USUAL_OBSERVATION)
+        "paper",
+        "The paper's network, a small one, or a fully convolutional one.",
+        choices=tuple(USUAL_OBSERVATION),
     )
-    features: int = setting(256, "Width of its fully connected layers; of `fcn`, its channels.", 1, 1 << 16)
-    frames: int = setting(1, "Observations that it sees at once, the last ones.", 1, 16)
+    features: int = setting(256, "Width of the fully connected layers, or channels of `fcn`.", 1, 1 << 16)
+    frames: int = setting(1, "Number of stacked observations.", 1, 16)
     reward: str = setting("task", "The task's reward, or its `shaped` one.", choices=("task", "shaped"))
     init_from: str = setting("", form="the folder of a dataset")
-    """The folder of a dataset whose actions the network learns first (behavior cloning)."""
-    init_expert: int = setting(
-        0, "Episodes of the task's expert, whose actions the network learns first; 0: none.", 0, 1_000_000
-    )
-    init_epochs: int = setting(10, "How often cloning goes over recorded actions.", 1, 100_000)
-    envs: int = setting(32, "Worlds that are played at once.", 1, 1 << 20)
-    rollout: int = setting(2048, "Actions in every world between two updates.", 1, 1 << 20)
-    batch: int = setting(256, "Actions that one gradient is taken of.", 2, 1 << 24)
-    epochs: int = setting(10, "How often an update goes over a rollout.", 1, 1000)
+    """Dataset whose actions the network imitates first (behavior cloning)."""
+    init_expert: int = setting(0, "Episodes of the task's expert to imitate first; 0: none.", 0, 1_000_000)
+    init_epochs: int = setting(10, "Epochs of cloning over recorded actions.", 1, 100_000)
+    envs: int = setting(32, "Number of parallel worlds.", 1, 1 << 20)
+    rollout: int = setting(2048, "Actions per world between two updates.", 1, 1 << 20)
+    batch: int = setting(256, "Minibatch size.", 2, 1 << 24)
+    epochs: int = setting(10, "Passes over each rollout.", 1, 1000)
     learning_rate: float = setting(3e-4, "Of Adam.", 1e-9, 10.0)
     schedule: str = setting(
         "constant",
-        "The learning rate's, over `steps`: constant, or linear to zero.",
+        "Learning rate schedule over `steps`: constant, or linear to zero.",
         choices=("constant", "linear"),
     )
-    gamma: float = setting(0.99, "Discount of later rewards.", 0.0, 1.0)
-    gae_lambda: float = setting(0.95, "Of generalized advantages.", 0.0, 1.0)
-    clip: float = setting(0.2, "How far an update may change chances.", 1e-6, 10.0)
+    gamma: float = setting(0.99, "Discount factor.", 0.0, 1.0)
+    gae_lambda: float = setting(0.95, "Lambda of generalized advantage estimation.", 0.0, 1.0)
+    clip: float = setting(0.2, "PPO clip range.", 1e-6, 10.0)
     entropy: float = setting(0.0, "Entropy coefficient.", 0.0, 100.0)
-    vf_coef: float = setting(0.5, "Coefficient of the values' loss.", 0.0, 100.0)
-    max_grad_norm: float = setting(0.5, "Gradients are clipped to this norm.", 1e-6, 1e6)
-    target_kl: float = setting(
-        0.0, "An update ends where the policy has changed this much; 0: never.", 0.0, 1e6
-    )
+    vf_coef: float = setting(0.5, "Coefficient of the value loss.", 0.0, 100.0)
+    max_grad_norm: float = setting(0.5, "Maximum norm of gradients, which are clipped to it.", 1e-6, 1e6)
+    target_kl: float = setting(0.0, "KL divergence that ends an update early; 0: none.", 0.0, 1e6)
     normalize: str = setting(
-        "advantage", "What is divided by its spread.", choices=("advantage", "reward", "both", "none")
+        "advantage", "What to normalize.", choices=("advantage", "reward", "both", "none")
     )
     precision: str = setting(
-        "float32", "Numbers that layers compute with; weights are float32.", choices=("float32", "bfloat16")
+        "float32", "Precision of layers; weights are float32.", choices=("float32", "bfloat16")
     )
-    seed: int = setting(0, "Of the run: worlds, network, and actions.", 0, 2**32 - 1)
+    seed: int = setting(0, "Seed of the worlds, the network and the actions.", 0, 2**32 - 1)
     steps: int = setting(
-        1_000_000, "Interactions, of all worlds together, such as 2e5.", 1, 10**12, may_change=True
+        1_000_000, "Interactions in all worlds together, such as 2e5.", 1, 10**12, may_change=True
     )
-    """A run ends with the first whole rollout that reaches them."""
+    """A run ends with the first complete rollout that reaches it."""
     backend: str = setting("auto", choices=tuple(BACKENDS), may_change=True)
     device: str = setting(
         "cpu", "A torch device: cpu, cuda, cuda:1.  [default: cpu]", form="a name", may_change=True
@@ -101,12 +99,12 @@ class TrainConfig:
         option="checkpoint-every",
         may_change=True,
     )
-    """How much work a kill may cost."""
+    """The work that a kill may cost."""
     eval_every: int = setting(
-        0, "Interactions between two evaluations in held-out worlds; 0: none.", 0, 10**12, may_change=True
+        0, "Interactions between evaluations on held-out worlds; 0: none.", 0, 10**12, may_change=True
     )
-    eval_split: str = setting("test", "Split of those worlds.", form="a name", may_change=True)
-    eval_episodes: int = setting(64, "How many of them.", 1, 1 << 20, may_change=True)
+    eval_split: str = setting("test", "Split of the held-out worlds.", form="a name", may_change=True)
+    eval_episodes: int = setting(64, "Number of held-out worlds.", 1, 1 << 20, may_change=True)
 
     def as_json(self) -> dict[str, Any]:
         """Return all settings as plain values, for JSON."""
@@ -114,15 +112,15 @@ class TrainConfig:
 
     @property
     def identity(self) -> dict[str, Any]:
-        """The settings that the result depends on: all but those of HOW. A falling learning rate depends on `steps`."""
+        """The settings that determine the result: all except those of HOW, plus `steps` with a linear schedule."""
         settings = {name: value for name, value in self.as_json().items() if name not in HOW}
         if self.precision == "float32":
-            del settings["precision"]  # runs that are older have none
+            del settings["precision"]  # older runs have none
         return settings if self.schedule == "constant" else {**settings, "steps": self.steps}
 
 
 HOW = tuple(field.name for field in fields(TrainConfig) if field.metadata.get("may_change"))
-"""Settings that may change when a run is resumed: how long and on which machine it trains, not what it trains."""
+"""Settings that may change when a run is resumed, which do not affect what it trains."""
 
 PRESETS: Mapping[str, Mapping[str, Any]] = MappingProxyType(
     {
@@ -152,8 +150,8 @@ PRESETS: Mapping[str, Mapping[str, Any]] = MappingProxyType(
         },
     }
 )
-"""``paper``: its network and settings. ``small``: a network and settings for a few minutes on one processor core. ``fcn``:
-a fully convolutional network with one score for each bin and deed."""
+"""``paper``: its network and settings. ``small``: a network and settings for a few minutes on one CPU core. ``fcn``: a
+fully convolutional network with a score for each bin and operation."""
 
 
 def preset(name: str, task: str, **changes: Any) -> TrainConfig:
@@ -171,16 +169,16 @@ def preset(name: str, task: str, **changes: Any) -> TrainConfig:
     if name not in PRESETS:
         problems.append(with_suggestion(f"there is no preset `{name}`", name, PRESETS, "presets"))
     values = {"task": task, **PRESETS.get(name, {}), **changes}
-    # The usual observation depends on the network.
+    # The default observation depends on the network.
     if "observation" not in changes and changes.get("network") in USUAL_OBSERVATION:
         values["observation"] = USUAL_OBSERVATION[changes["network"]]
     return from_json(values, problems)
 
 
 def from_json(values: Mapping[str, Any], mistakes: Sequence[str] = ()) -> TrainConfig:
-    """Read the settings that `TrainConfig.as_json` gave; missing ones get their defaults.
+    """Read settings written by `TrainConfig.as_json`; missing ones get their defaults.
 
-    Raises CompileError (PD640) with everything that is wrong in them, after `mistakes` that are known already.
+    Raises CompileError (PD640) with all mistakes in them, after those in `mistakes`.
     """
     problems = [*mistakes]
     config = read_record(TrainConfig, values, problems)
@@ -192,7 +190,7 @@ def from_json(values: Mapping[str, Any], mistakes: Sequence[str] = ()) -> TrainC
 
 
 def check_task(config: TrainConfig, task: Task) -> None:
-    """Raise CompileError if a task lacks what the settings ask for: a split (PD801), or something else (PD640)."""
+    """Raise CompileError if a task lacks a split (PD801) or something else (PD640) that the settings need."""
     check_split(task, config.split)
     if config.eval_every:
         check_split(task, config.eval_split)
@@ -208,7 +206,7 @@ def check_task(config: TrainConfig, task: Task) -> None:
 def chosen_policies(policies: Sequence[str] | None, task: Task, *, trained: bool) -> list[str]:
     """The policies to play, in the order of POLICIES. Raises ValueError.
 
-    `policies`: some of POLICIES; None: all, but not an expert that searches. `trained`: whether there is a trained one.
+    `policies`: some of POLICIES; None: all except an expert that searches. `trained`: there is a trained policy.
     """
     there = {"trained": trained, "expert": task.expert is not None}
     known = [policy for policy in POLICIES if there.get(policy, True)]
@@ -222,18 +220,18 @@ def chosen_policies(policies: Sequence[str] | None, task: Task, *, trained: bool
 
 def _contradictions(config: TrainConfig) -> Iterator[str]:
     if config.init_from and config.init_expert:
-        yield "`init_from` and `init_expert` are both given: the network learns from one of them"
+        yield "`init_from` and `init_expert` cannot be combined"
     if config.observation == "laws" and config.network != "small":
         yield "`observation`: only the network `small` reads laws"
     if config.init_from or config.init_expert:
         if config.frames != 1:
-            yield "`frames`: recorded actions belong to single observations, so cloning takes 1"
+            yield "`frames`: recorded actions belong to single observations, so cloning requires 1"
         if config.observation == "matrix":
             yield "`observation`: episodes are recorded as `ids`, `compact` or `laws`, not as `matrix`"
     if config.rollout * config.envs < 2:
-        yield "`rollout` × `envs` is 1: an update needs two actions or more"
+        yield "`rollout` × `envs` is 1: an update needs at least two actions"
 
 
 def _mistake(message: str) -> Diagnostic:
-    """A diagnostic of settings, which have no place in a file."""
+    """A diagnostic about settings, which have no location in a file."""
     return Diagnostic("PD640", message, Label(None))

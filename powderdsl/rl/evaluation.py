@@ -1,4 +1,4 @@
-"""Evaluation of policies: returns in many worlds of each split, beside those of other policies; and films of episodes."""
+"""Evaluation of policies: returns in many worlds of each split, compared with other policies; and videos."""
 
 from __future__ import annotations
 
@@ -31,13 +31,13 @@ from powderdsl.tasks.tensors.actions import cells_of
 
 EVALUATION = "evaluation.json"
 BATCH = 256
-"""Episodes that are played at once."""
+"""Number of episodes played at once."""
 TRAINING_STARTS = 1024
-"""Training worlds that others are compared with."""
+"""Number of training worlds to compare others with."""
 
 
 class Played(NamedTuple):
-    """Episodes that were played: `returns` float64 [n]; `lengths` int64 [n], actions; `success` bool [n], at the end."""
+    """Played episodes: `returns` float64 [n]; `lengths` int64 [n], in actions; `success` bool [n], at the end."""
 
     returns: Tensor
     lengths: Tensor
@@ -46,12 +46,12 @@ class Played(NamedTuple):
 
 @dataclass(frozen=True)
 class Score:
-    """A policy on a split. `interval` is half of the 95 % interval of `mean`; None of one episode.
+    """The score of a policy on a split. `interval` is half of the 95 % interval of `mean`; None for one episode.
 
-    `above` has the mean difference to each of BASELINES in the same worlds, with its own interval, as far as they were
-    played and are others. `success` is None for tasks that do not say what success is. `normalized` is the mean on a
-    scale where doing nothing is 0 and the task's expert 1, with its interval, paired by world (delta method); None unless
-    both were played and the expert is better.
+    `above` has the mean difference from each other policy of BASELINES played in the same worlds, with its interval.
+    `success` is None for tasks without a condition for success. `normalized` is the mean on a scale where doing nothing
+    is 0 and the task's expert 1, with its interval, paired by world (delta method); None unless both were played and
+    the expert is better.
     """
 
     split: str
@@ -67,8 +67,8 @@ class Score:
 
 @dataclass(frozen=True)
 class Seen:
-    """Worlds of a split that start as one of the first TRAINING_STARTS training worlds does: how many there are, and the
-    means and intervals of policies without them."""
+    """Worlds of a split that start like one of the first TRAINING_STARTS training worlds: their number, and the means
+    and intervals of policies without them."""
 
     worlds: int
     without: Mapping[str, Estimate]
@@ -76,10 +76,10 @@ class Seen:
 
 @dataclass(frozen=True)
 class Evaluation:
-    """Scores of policies on splits. `step`: the interactions that the trained one had learned from.
+    """Scores of policies on splits. `step`: the number of interactions of the trained policy.
 
-    `unchanged`: in how many worlds of each split all policies that were played got the same return, if several were.
-    `seen`: of each split but the one that is trained on.
+    `unchanged`: for each split, the number of worlds in which all policies got the same return, if there are several.
+    `seen`: for each split except the training split.
     """
 
     task: str
@@ -112,10 +112,10 @@ def play(
     """One episode in each of some worlds.
 
     Args:
-        policy: an expert sees the episodes themselves. None does nothing at all: the worlds run by themselves.
-        worlds: which, int64 [n]. numbers: of the episodes, int64 [n], which a policy's random numbers depend on together
-            with `seed`; 0, 1, … otherwise.
-        recorder: is shown all worlds and actions.
+        policy: an expert sees the episodes themselves. None: the worlds run without an agent.
+        worlds: numbers of worlds, int64 [n]. numbers: numbers of the episodes, int64 [n], which with `seed` determine a
+            policy's random numbers; by default 0, 1, ….
+        recorder: receives all worlds and actions.
     """
     if program.is_mixed:
         return _play_mixed(program, policy, worlds, observation, numbers, seed)
@@ -140,7 +140,7 @@ def play(
         seen = None
         if recorder is not None:
             seen, recorder.actions = recorder.see, actions
-        # Episodes that are over run on, and no longer count.
+        # Finished episodes continue to run, but are ignored.
         episodes, reward, success, over = program.act(episodes, actions, reuse=seen is None, seen=seen)
         returns += torch.where(going, reward.double(), 0.0)
         lengths += going
@@ -161,7 +161,7 @@ def _play_mixed(
     numbers: Tensor | None,
     seed: int,
 ) -> Played:
-    """`play` where worlds run under different rulesets: ruleset by ruleset."""
+    """`play` for worlds under different rulesets, one ruleset after another."""
     numbers = torch.arange(len(worlds)) if numbers is None else numbers
     parts, places = [], []
     for chosen, own in program.apart(worlds):
@@ -192,15 +192,15 @@ def evaluate(
 
     Args:
         run_or_task: a run, its path or its name; or a `Task`, which has no trained policy.
-        splits: names of splits; all splits of the task unless given.
-        policies: some of ``trained``, ``expert``, ``random``, ``nothing``. Unless given, all that the task and the run
-            have, except an expert that searches, which is slow.
+        splits: names of splits; by default, all splits of the task.
+        policies: some of ``trained``, ``expert``, ``random``, ``nothing``. By default, all available ones except an
+            expert that searches, which is slow.
         episodes: the number of episodes on each split.
-        deterministic: the trained policy takes the likeliest action, instead of drawing one.
-        seed: seed of the actions that policies draw.
-        backend: that of the run unless given.
-        device: that of the run unless given.
-        packs: names or files of packs that are added to the rules of a run's task.
+        deterministic: the trained policy takes the most likely action instead of sampling one.
+        seed: seed of the policies' random numbers.
+        backend: by default, that of the run.
+        device: by default, that of the run.
+        packs: names or files of packs to add to the rules of a run's task.
 
     Returns:
         The mean return of each policy on each split with its 95 % interval, lengths of episodes, and rates of success.
@@ -240,7 +240,7 @@ def evaluate(
             returns = torch.stack([play.returns for play in played.values()])
             unchanged[name] = int((returns == returns[0]).all(0).sum())
         if name != config.split:
-            if own.is_mixed:  # only worlds under the rules of both splits can be the same
+            if own.is_mixed:  # only worlds under rules of both splits can be equal
                 both = torch.tensor([rules in program.rulesets for rules in own.rulesets])
                 training = {*_starts(own, training_worlds[both[own.ruleset_of(training_worlds)]])}
             new = torch.tensor([start not in training for start in _starts(program, worlds)])
@@ -267,9 +267,9 @@ def subject(
 def player(
     name: str, program: TaskProgram, run: RunFolder | None = None, *, deterministic: bool = False
 ) -> Policy | ExpertPlayer | None:
-    """The policy of a name among POLICIES; None does nothing. Raises CompileError as `load_policy`.
+    """The policy with a name among POLICIES; None does nothing. Raises CompileError as `load_policy`.
 
-    `run`: whose policy the trained one is. `deterministic`: it takes the likeliest action.
+    `run`: the run of the trained policy. `deterministic`: it takes the most likely action.
     """
     if name == "trained" and run is not None:
         env = environment(program, 1, observation=config_of(run).observation)
@@ -334,7 +334,7 @@ def _ratio(values: Tensor, scale: Tensor) -> Estimate | None:
     return Estimate(ratio, None if half is None else half / whole)
 
 
-# Films: worlds side by side, with regions, what the agent does, and the return so far
+# Videos: worlds side by side, with regions, actions, and the return so far
 
 
 LINE = 14
@@ -394,26 +394,26 @@ def film(
 
 
 class Film:
-    """Keeps the scenes of `play`, and draws them with cells of `factor`² pixels."""
+    """Stores the scenes of `play`, and draws them with cells of `factor`² pixels."""
 
     def __init__(self, task: Task, count: int, factor: int) -> None:
         self.task, self.factor = task, factor
         self.regions: dict[str, NDArray[np.bool_]] = {}
         self.scenes: list[FilmScene] = []
         self.actions: Tensor | None = None
-        """Those that lead to the scenes that follow."""
+        """The actions that lead to the following scenes."""
         self._returns = torch.zeros(count, dtype=torch.float64)
         self._over = torch.zeros(count, dtype=torch.bool)
         self._fields = shown_fields(task.ruleset)
         self._looks, self._font = looks(task.ruleset.elements, task.ruleset.fields), ImageFont.load_default()
 
     def begin(self, episodes: Episodes) -> None:
-        """Keep the worlds at their start."""
+        """Record the worlds at their start."""
         self.regions = {name: value.cpu().numpy() for name, value in episodes.regions.items()}
         self.see(episodes.world)
 
     def see(self, world: World) -> None:
-        """Keep the worlds after an action, or a step."""
+        """Record the worlds after an action or a step."""
         fields = {name: world[name].cpu().numpy().copy() for name in self._fields}
         ids = world.ids.cpu().numpy().copy()
         self.scenes.append(FilmScene(ids, fields, self.actions, self._returns, self._over))

@@ -35,17 +35,17 @@ from powderdsl.tasks.shipped import load_task
 from powderdsl.tasks.task import Task
 
 DILATIONS = (1, 2, 4)
-"""Of the residual blocks. With the first convolution, an output sees 17 bins in each direction, and the mean of all."""
+"""Dilations of the residual blocks. With the first convolution, an output sees 17 bins in each direction."""
 
 OPTIMIZER = {"eps": 1e-5, "fused": True}
-"""Of Adam; `eps` as Stable-Baselines3 has it."""
+"""Arguments of Adam; `eps` is that of Stable-Baselines3."""
 
 
 def fcn_policy(env: TensorEnv, channels: int = 32, frames: int = 1) -> dict[str, Any]:
     """`policy_kwargs` of `BinPolicy` for the observations and actions of an environment.
 
-    `channels`: of each convolution. `frames`: how many observations are stacked. Raises ValueError for observations
-    that are pictures.
+    `channels`: channels of each convolution. `frames`: number of stacked observations. Raises ValueError for
+    observations that are pictures.
     """
     bins = env.task.agent.bins
     form = action_form("discrete", env.task.agent, torch.device("cpu"))
@@ -53,7 +53,7 @@ def fcn_policy(env: TensorEnv, channels: int = 32, frames: int = 1) -> dict[str,
 
 
 class Trunk(nn.Module):
-    """From patches [B, C, rows, columns], with their places among the channels, to features [B, F, rows, columns]."""
+    """From patches [B, C, rows, columns], whose channels include positions, to features [B, F, rows, columns]."""
 
     def __init__(self, channels: int, width: int):
         super().__init__()
@@ -70,7 +70,7 @@ class Trunk(nn.Module):
 
 
 class Residual(torch.autograd.Function):
-    """``x + (convolution(x) + linear(mean(x))).relu()``, which writes fewer tensors than its parts do one by one."""
+    """``x + (convolution(x) + linear(mean(x))).relu()``, which writes fewer tensors than separate operations."""
 
     @staticmethod
     def forward(ctx: Any, x: Tensor, *given: Any) -> Tensor:
@@ -95,7 +95,8 @@ class Residual(torch.autograd.Function):
 
 @dataclass(frozen=True)
 class BinDistribution:
-    """One choice among the values of a ``discrete`` form of actions. Actions are (x, y, choice, vx, vy), int64 [B, 5]."""
+    """A distribution over values of a ``discrete`` form of actions. Actions are (x, y, choice, vx, vy), int64 [B,
+    5]."""
 
     form: ActionForm
     distribution: Categorical
@@ -113,12 +114,12 @@ class BinDistribution:
 
 
 class BinPolicy(ActorCriticPolicy):
-    """The policy: convolutions that keep the bins, and a score for each bin and deed. The value has convolutions of its
-    own: its errors, which are large at first, do not change what the scores see.
+    """A policy with convolutions that preserve the bins, and a score for each bin and operation. The value has separate
+    convolutions, so that its errors, which are large at first, do not affect the scores.
 
     Args:
-        see: from observations to patches, one for each bin. channels: of each convolution. bins: rows and columns.
-        form: the ``discrete`` form of actions, whose order is that of the scores: deed by deed, row by row.
+        see: maps observations to patches, one per bin. channels: channels of each convolution. bins: rows and columns.
+        form: the ``discrete`` form of actions, whose order is that of the scores: by operation, then by row.
     """
 
     def __init__(
@@ -146,7 +147,7 @@ class BinPolicy(ActorCriticPolicy):
         self.see, self.trunk = see, Trunk(see.channels + 2, width)
         deeds, idle = divmod(form.nvec[0], bins[0] * bins[1])
         self.scores = nn.Conv2d(width, deeds, 1)
-        self.idle = nn.Linear(width, 1) if idle else None  # doing nothing has no place
+        self.idle = nn.Linear(width, 1) if idle else None  # doing nothing has no location
         self.judge = nn.Sequential(
             nn.Conv2d(see.channels + 2, width, 3, 2, 1),
             nn.ReLU(inplace=True),
@@ -163,17 +164,17 @@ class BinPolicy(ActorCriticPolicy):
                 nn.init.orthogonal_(layer.weight, math.sqrt(2))
         for last in (self.scores, self.idle):
             if last is not None:
-                nn.init.orthogonal_(last.weight, 0.01)  # all actions about equally likely
+                nn.init.orthogonal_(last.weight, 0.01)  # initially, all actions are about equally likely
         self.form = form
         make: Any = self.optimizer_class
         self.optimizer = make(self.parameters(), lr=lr_schedule(1), **OPTIMIZER)
 
     def _seen(self, observed: Tensor) -> Tensor:
-        """Patches and their places, [B, C + 2, rows, columns]."""
+        """Patches and their positions, [B, C + 2, rows, columns]."""
         with torch.no_grad():
             patches = self.see(observed).permute(0, 2, 3, 1)
             places = self.get_buffer("places").permute(1, 2, 0).expand(len(patches), -1, -1, -1)
-            return torch.cat([patches, places], 3).permute(0, 3, 1, 2)  # channels are the last in memory
+            return torch.cat([patches, places], 3).permute(0, 3, 1, 2)  # channels last in memory
 
     def _distribution(self, seen: Tensor) -> BinDistribution:
         features = self.trunk(seen)
@@ -214,7 +215,7 @@ def policy_of(config: TrainConfig, env: TensorEnv) -> tuple[type[ActorCriticPoli
 
 
 def compute_in(precision: str, policy: ActorCriticPolicy) -> None:
-    """Let the layers of a policy compute in ``bfloat16``, except for the last ones; ``float32`` is what they do already."""
+    """Make all but the last layers of a policy compute in ``bfloat16``; ``float32`` changes nothing."""
     net: Any = policy
     layers = [net.trunk, *net.judge[:-1]] if isinstance(policy, BinPolicy) else [net.features_extractor]
     for layer in layers if precision == "bfloat16" else ():
@@ -224,19 +225,19 @@ def compute_in(precision: str, policy: ActorCriticPolicy) -> None:
 
 @dataclass(frozen=True)
 class TrainedPolicy:
-    """The policy of a run: a function as `envs.actions.Policy` says.
+    """The policy of a run, an `envs.actions.Policy`.
 
-    `deterministic`: the likeliest action, instead of one drawn. If `frames` is not 1, it takes that many observations,
+    `deterministic`: take the most likely action instead of sampling one. With `frames` above 1, it takes observations
     stacked by a `FrameStack`.
     """
 
     network: ActorCriticPolicy
     observation: str
-    """The kind of observation it takes."""
+    """Its form of observation."""
     channels: int
-    """How many of its channels, from the first."""
+    """The number of channels used, from the first."""
     step: int
-    """The interactions that it has learned from."""
+    """The number of interactions it was trained on."""
     deterministic: bool = False
     frames: int = 1
 
@@ -259,7 +260,7 @@ class TrainedPolicy:
 
 
 class _NoOptimizer:
-    """No optimizer, for networks that only act: a process's first one imports torch's compiler, which takes a second."""
+    """No optimizer, for networks that only act: the first one of a process imports torch's compiler for a second."""
 
     def __init__(self, *_: object, **__: object):
         pass
@@ -270,8 +271,8 @@ def load_policy(run: RunFolder | str | Path, env: TensorEnv, *, deterministic: b
 
     Args:
         run: a run, its path or its name.
-        env: the environment to play. Its rules may have packs that the run did not know: see `task_of`.
-        deterministic: take the likeliest action, instead of drawing one.
+        env: the environment to play. Its rules may have packs that training did not have: see `task_of`.
+        deterministic: take the most likely action instead of sampling one.
 
     Returns:
         A function from observations [B, …] and keys, int64 [B], to actions, int64 [B, 5]: see `envs.actions.Policy`.
@@ -282,7 +283,7 @@ def load_policy(run: RunFolder | str | Path, env: TensorEnv, *, deterministic: b
     folder = find_run(run, "ppo")
     config = config_of(folder)
     if env.observation.kind != config.observation:
-        why = f"it sees `{config.observation}`; the environment shows `{env.observation.kind}`"
+        why = f"it needs `{config.observation}`; the environment has `{env.observation.kind}`"
         raise misfit(folder.path, why)
     own = _own_env(folder, config, env)
     checkpoint = folder.checkpoint()
@@ -293,7 +294,7 @@ def load_policy(run: RunFolder | str | Path, env: TensorEnv, *, deterministic: b
         space = Box(low, high, dtype=space.dtype.type)
     actions, rate = MultiDiscrete(np.array(own.action_nvec)), config.learning_rate
     network = kind(space, actions, lambda _: rate, **how | {"optimizer_class": _NoOptimizer})
-    with reporting_misfits(folder.path, "its network is another"):
+    with reporting_misfits(folder.path, "its network has another shape"):
         network.load_state_dict(checkpoint.state["policy"])
     network.to(env.device).set_training_mode(False)
     compute_in(config.precision, network)
@@ -302,7 +303,7 @@ def load_policy(run: RunFolder | str | Path, env: TensorEnv, *, deterministic: b
 
 
 def _own_env(run: RunFolder, config: TrainConfig, env: TensorEnv) -> TensorEnv:
-    """The environment that the run's network was made for: `env`, or one without the packs that came later.
+    """The environment for which the run's network was created: `env`, or one without packs added later.
 
     Raises CompileError (PD623) if `env` has elements for which the network has no slots.
     """
@@ -315,7 +316,7 @@ def _own_env(run: RunFolder, config: TrainConfig, env: TensorEnv) -> TensorEnv:
 
 
 def task_of(run: RunFolder, packs: Sequence[str] = ()) -> Task:
-    """The task of a run, with the ids that its network knows. `packs` are added to its rules.
+    """The task of a run, with the ids of its network. `packs` are added to its rules.
 
     Raises CompileError: PD640 if its settings are damaged; what `load_task` raises.
     """
@@ -330,5 +331,5 @@ def task_of(run: RunFolder, packs: Sequence[str] = ()) -> Task:
 
 
 def config_of(run: RunFolder) -> TrainConfig:
-    """The settings that a run was begun with. Raises CompileError (PD640) if they are damaged."""
+    """The initial settings of a run. Raises CompileError (PD640) if they are damaged."""
     return from_json({name: value for name, value in run.config.items() if name not in BESIDES})

@@ -1,4 +1,4 @@
-"""PPO of Stable-Baselines3's in a run folder. A run that was killed resumes as if nothing had happened.
+"""Stable-Baselines3's PPO in a run folder. A killed run resumes with the same result.
 
 Everything that later rollouts depend on is saved between two rollouts: the policy and its optimizer, the worlds, all
 random numbers. Files are read with ``weights_only``: networks are built from the settings, so loading executes nothing.
@@ -60,13 +60,13 @@ from powderdsl.tasks.shipped import load_task
 
 KIND = "ppo"
 ASKED = "asked.json"
-"""The settings of the latest call, with those that may change."""
+"""The settings of the latest call, including those that may change."""
 SPEED = "speed.json"
-"""How many interactions the latest call trained, in how many seconds, and how many of these went where."""
+"""The interactions and seconds of the latest call, and how the seconds were spent."""
 DEMONSTRATIONS = "demonstrations"
 """The dataset of `init_expert`."""
 CLONING_RATE, CLONING_BATCH = 3e-3, 256
-"""Of Adam, in behavior cloning; transitions of a gradient."""
+"""Adam's learning rate, and the minibatch size, in behavior cloning."""
 
 Progress = Callable[[int, float | None], None]
 """Called after every action with the interactions so far, and the mean return of the last 100 episodes."""
@@ -75,26 +75,26 @@ Progress = Callable[[int, float | None], None]
 def train(config: TrainConfig, folder: str | Path, *, progress: Progress | None = None) -> RunFolder:
     """Train until `config.steps` interactions are reached.
 
-    Rollouts are whole: a run ends with the first that reaches `steps`. On a CPU, a run that is interrupted and continues
-    gives the same weights, bit for bit, as one that is not; so does a run whose `steps` are raised.
+    A run ends with the first complete rollout that reaches `steps`. On a CPU, interrupting and resuming a run, or
+    raising its `steps`, gives the same weights, bit for bit, as an uninterrupted run.
 
     Args:
         config: the settings.
-        folder: the folder of a new run, or of the run to continue.
+        folder: the folder of a new run, or of the run to resume.
         progress: called after every action with the interactions so far, and the mean return of the last 100 episodes.
 
     Returns:
         The folder of the run, with its checkpoints and metrics.
 
     Raises:
-        CompileError: PD640 for settings, all mistakes at once; the errors of `load_task`; PD621 if the folder holds
+        CompileError: PD640 with all mistakes in settings; the errors of `load_task`; PD621 if the folder contains
             another run; PD622 if another process trains there.
-        KeyboardInterrupt: after the state before the rollout that was in progress has been saved.
+        KeyboardInterrupt: after saving the state before the current rollout.
     """
-    from_json(config.as_json())  # raises what is wrong in settings that were made without `preset`
+    from_json(config.as_json())  # check settings that were created without `preset`
     how: dict[str, Any] = {name: getattr(config, name) for name in ("knobs", "params", "packs")}
     used = whole_palette(*load_task(config.task, **how).rules)
-    palette = (*used, *[None] * (config.slots - len(used)))  # slots that the rules need, and free ones
+    palette = (*used, *[None] * (config.slots - len(used)))  # slots for the rules, and free ones
     task = load_task(config.task, **how, palette=palette)
     check_task(config, task)
     trained_on = task.with_shaped_reward() if config.reward == "shaped" else task
@@ -112,7 +112,7 @@ def train(config: TrainConfig, folder: str | Path, *, progress: Progress | None 
         plain["shaped_fingerprint"] = fingerprint(trained_on)
     half = config.precision == "bfloat16" and config.device == "cpu"
     if half and not torch.cpu._is_avx512_bf16_supported():
-        raise failure("PD640", "`precision`: this processor does not compute in bfloat16")
+        raise failure("PD640", "`precision`: this processor does not support bfloat16")
     run = open_run(folder, KIND, plain)
     with lock_folder(run.path), _own_random_numbers(config.threads):
         write_json(run.path / ASKED, config.as_json())
@@ -132,7 +132,7 @@ def train(config: TrainConfig, folder: str | Path, *, progress: Progress | None 
         with Metrics(run.path, step) as metrics:
             learner.model.set_logger(Logger(None, [_MetricsWriter(metrics)]))
             if checkpoint is not None:
-                with reporting_misfits(checkpoint.path, "its state is that of another run"):
+                with reporting_misfits(checkpoint.path, "its state belongs to another run"):
                     learner.restore(checkpoint.state)
             elif config.init_from or config.init_expert:
                 _clone(learner, run, config, metrics)
@@ -145,7 +145,7 @@ def train(config: TrainConfig, folder: str | Path, *, progress: Progress | None 
             try:
                 learner.model.learn(config.steps - step, keeper, reset_num_timesteps=checkpoint is None)
             except KeyboardInterrupt:
-                # The state before the rollout that is in progress, unless it has been saved.
+                # The state before the current rollout, unless it has been saved.
                 if keeper.latest is not None and keeper.latest[0]:
                     run.save_checkpoint(*keeper.latest)
                 raise
@@ -157,23 +157,25 @@ def train(config: TrainConfig, folder: str | Path, *, progress: Progress | None 
 
 
 class _Rollout(RolloutBuffer):
-    """A rollout. If `see` is given, it keeps what that counts in observations: once, for all epochs."""
+    """A rollout. If `see` is given, it stores that network's counts of observations once for all epochs."""
 
     def __init__(self, size: int, space: Any, *rest: Any, see: Patches | None, **how: Any):
         self.see = see
         if see is not None:
-            cells = round(1 / float(see.get_buffer("share").min()))  # of the largest patch
+            cells = round(
+                1 / float(see.get_buffer("share").min())
+            )  # the number of cells of the largest patch
             space = Box(0, cells, (*see.patches, see.elements), np.uint8 if cells < 256 else np.int32)
         super().__init__(size, space, *rest, **how)
 
     def add(self, obs: Any, *rest: Any) -> None:
-        """Add an action in every world, and what led to it and came of it."""
+        """Add an action in every world, with its observation and results."""
         if self.see is not None:
             obs = self.see.count(torch.as_tensor(obs, device=self.device)).cpu().numpy()
         super().add(obs, *rest)
 
     def scores(self, worlds: Any) -> tuple[torch.Tensor, torch.Tensor]:
-        """The worlds of episodes, int64 [n], and the mean of what was better than expected in each, float64 [n].
+        """The worlds of episodes, int64 [n], and the mean positive advantage in each, float64 [n].
 
         `worlds`: of all observations, int64 [steps, envs].
         """
@@ -186,7 +188,7 @@ class _Rollout(RolloutBuffer):
 
 
 class _Learner:
-    """The PPO of a run, with its environment: perhaps with stacked observations and normalized rewards."""
+    """The PPO of a run, and its environment, possibly with stacked observations and normalized rewards."""
 
     def __init__(self, config: TrainConfig, program: TaskProgram):
         self.config = config
@@ -210,7 +212,7 @@ class _Learner:
         kind, how = policy_of(config, self.worlds.tensors)
         see = (how if "see" in how else how["features_extractor_kwargs"])["see"]
         with warnings.catch_warnings():
-            # Where batches do not divide a rollout, the last one of an epoch is smaller: no mistake.
+            # If batches do not divide a rollout, the last one of an epoch is smaller, which is fine.
             warnings.filterwarnings("ignore", "You have specified a mini-batch size", UserWarning)
             self.model = PPO(
                 kind,
@@ -258,7 +260,7 @@ class _Learner:
         return self.model.num_timesteps
 
     def state(self) -> dict[str, Any]:
-        """Everything that later training depends on. Tensors of the model are not copied."""
+        """Everything that later training depends on, without copies of the model's tensors."""
         model = self.model
         state = {
             "policy": model.policy.state_dict(),
@@ -268,7 +270,7 @@ class _Learner:
             "episodes": [[episode[key] for key in "rlt"] for episode in model.ep_info_buffer or ()],
             "successes": [bool(success) for success in model.ep_success_buffer or ()],
             "updates": model._n_updates,
-            # Of the update that is shown after the next rollout.
+            # Logged values of the update, which are shown after the next rollout.
             "logged": _numbers(model.logger.name_to_value),
             "steps": self.step,
             "random": _random_state(),
@@ -309,10 +311,10 @@ class _Learner:
 
 
 def _rate(config: TrainConfig) -> float | Callable[[float], float]:
-    """The learning rate, or that of an update by the share of `steps` left after its rollout.
+    """The learning rate, or its schedule as a function of the share of `steps` left after a rollout.
 
-    It falls evenly over the updates: the first of n has all of it, the last 1/n. The share left cannot be used as it is,
-    since it is negative where the last rollout goes beyond `steps`.
+    It falls linearly over the updates: the first of n has the full rate, the last 1/n of it. The share left cannot be
+    used directly, since it is negative if the last rollout exceeds `steps`.
     """
     if config.schedule == "constant":
         return config.learning_rate
@@ -327,7 +329,7 @@ def _rate(config: TrainConfig) -> float | Callable[[float], float]:
 
 
 def _clone(learner: _Learner, run: RunFolder, config: TrainConfig, metrics: Metrics) -> None:
-    """Behavior cloning of `config.init_from`, or of the task's expert. Its numbers are metrics of the run at step 0."""
+    """Behavior cloning from `config.init_from` or the task's expert. Its results are metrics of the run at step 0."""
     env, folder = learner.worlds.tensors, Path(config.init_from)
     if config.init_expert:
         folder = run.path / DEMONSTRATIONS
@@ -348,11 +350,10 @@ def _clone(learner: _Learner, run: RunFolder, config: TrainConfig, metrics: Metr
 
 
 def clone(policy: ActorCriticPolicy, dataset: Dataset, config: TrainConfig) -> float:
-    """Behavior cloning: fit a policy to a dataset, its likelihood of the actions, and its values to the discounted returns.
+    """Behavior cloning: fit a policy to the actions of a dataset, and its values to the discounted returns.
 
-    `config.init_epochs` times as many transitions are drawn as there are; which ones depends on `config.seed` alone. The
-    learning rate falls to zero. Returns the loss, without that of the values: its mean over the last hundred updates at
-    most.
+    It draws `config.init_epochs` times the number of transitions, depending only on `config.seed`. The learning rate
+    falls to zero. Returns the mean loss of the actions over the last hundred updates.
     """
     rows, returns = Transitions(dataset), _returns(dataset, config.gamma)
     updates = max(1, config.init_epochs * len(rows) // CLONING_BATCH)
@@ -381,7 +382,7 @@ def clone(policy: ActorCriticPolicy, dataset: Dataset, config: TrainConfig) -> f
 
 
 def _returns(dataset: Dataset, gamma: float) -> NDArray[np.float32]:
-    """The discounted return from each transition on, float32 [transitions], in the order of the dataset."""
+    """The discounted return from each transition onward, float32 [transitions], in the order of the dataset."""
     parts = []
     for number in range(len(dataset)):
         reward = dataset.episode(number).reward.double().numpy()
@@ -391,10 +392,10 @@ def _returns(dataset: Dataset, gamma: float) -> NDArray[np.float32]:
 
 
 class _Keeper(BaseCallback):
-    """Between rollouts, saves or keeps the latest state in memory, and plays the policy in held-out worlds.
+    """Between rollouts, saves the state or keeps it in memory, and plays the policy in held-out worlds.
 
-    Training does not depend on these worlds, if there are any: they give ``held_out/return`` of the metrics. `played` is
-    the interactions up to which they have been played; -1 for a run that begins.
+    Training does not depend on these worlds, whose return is the metric ``held_out/return``. `played` is the number of
+    interactions at the last evaluation; -1 for a new run.
     """
 
     def __init__(
@@ -430,7 +431,7 @@ class _Keeper(BaseCallback):
         return True
 
     def play_held_out(self, step: int) -> None:
-        """Play after some interactions, if a multiple of `eval_every` lies in the last rollout, and before the first."""
+        """Play if a multiple of `eval_every` is in the last rollout, and before the first rollout."""
         config, policy = self.learner.config, self.learner.model.policy
         before, played = step - config.rollout * config.envs, self.played
         self.played = step
@@ -458,7 +459,7 @@ class _MetricsWriter(KVWriter):
         self.metrics.write(step, _numbers(key_values))
 
     def close(self) -> None:
-        """The run closes its metrics."""
+        """Do nothing: the run closes its metrics."""
 
 
 def _numbers(values: Mapping[str, Any]) -> dict[str, float]:
@@ -488,14 +489,14 @@ def _set_random_state(state: Mapping[str, Any]) -> None:
     name, keys, *rest = state["numpy"]
     np.random.set_state((name, keys.numpy().astype(np.uint32), *rest))
     torch.set_rng_state(state["torch"])
-    # A run may continue with other devices than it had.
+    # A run may resume on other devices.
     if torch.cuda.is_available() and len(state.get("cuda", ())) == torch.cuda.device_count():
         torch.cuda.set_rng_state_all(state["cuda"])
 
 
 @contextmanager
 def _own_random_numbers(threads: int) -> Iterator[None]:
-    """Restore the caller's generators and number of threads at the end. Till then, distributions check no numbers."""
+    """Restore the caller's generators and number of threads at the end. Until then, distributions skip validation."""
     before, used, checks = _random_state(), torch.get_num_threads(), Distribution._validate_args
     torch.set_num_threads(threads)
     Distribution.set_default_validate_args(False)
@@ -510,7 +511,7 @@ def _own_random_numbers(threads: int) -> Iterator[None]:
 
 
 def _keep_memory(size: int) -> None:
-    """Let glibc keep so many free bytes: tensors of an update are as large each time, and new pages are slow."""
+    """Let glibc keep this many free bytes: each update needs tensors of the same size, and new pages are slow."""
     library: Any = ctypes.CDLL(None) if sys.platform == "linux" else None
     for parameter in (-1, -3) if hasattr(library, "mallopt") else ():  # M_TRIM_THRESHOLD, M_MMAP_THRESHOLD
         library.mallopt(parameter, size)

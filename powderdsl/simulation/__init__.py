@@ -1,1 +1,1 @@
-"""Runs rules: worlds, the simulator, the choice of a target, and observations."""
+"""Running rules: worlds, the simulator, the choice of a backend, and observations."""

@@ -1,4 +1,4 @@
-"""Worlds -> RGB pictures, one pixel a cell, from arrays or tensors; pictures are NumPy arrays."""
+"""Worlds as RGB pictures (NumPy arrays), one pixel per cell, from arrays or tensors."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from powderdsl.model.types import ColorRamp, Element, Field, Ruleset
 from powderdsl.targets.array_kind import Array, ArrayKind
 
 OUTLINES = ((255, 0, 160), (0, 160, 255), (255, 160, 0), (0, 200, 80))
-"""Colors of regions, in their order in the file; they repeat after the fourth."""
+"""Colors of regions, in the order of the file; they repeat after the fourth."""
 
 
 def palette(elements: Sequence[Element]) -> NDArray[np.uint8]:
@@ -29,7 +29,7 @@ def palette(elements: Sequence[Element]) -> NDArray[np.uint8]:
 
 @dataclass(frozen=True, eq=False)
 class Ramp:
-    """The colors of the element `id` by the values of a field: `colors[n]` where n of `starts` are reached.
+    """The colors of the element `id` by the value of a field: `colors[n]` if the value reaches n of `starts`.
 
     `starts` ascend, int32 [n] or float32 [n] like the field; `colors` is uint8 [n + 1, 4], as in `palette`. A picture
     only compares values, so it is the same on every machine.
@@ -48,7 +48,7 @@ def ramps(elements: Sequence[Element]) -> tuple[Ramp, ...]:
 
 @dataclass(frozen=True)
 class CellTint:
-    """A tint of cells by the vectors of a field: toward `color`, float32 in 0..1, by |v| / `full`, at most by `most`."""
+    """A tint of cells by the vectors v of a field: toward `color`, float32 in 0..1, by |v| / `full`, at most `most`."""
 
     field: str
     color: tuple[float, float, float]
@@ -73,7 +73,7 @@ def looks(elements: Sequence[Element], fields: Sequence[Field]) -> dict[str, Any
 
 
 def shown_fields(ruleset: Ruleset) -> tuple[str, ...]:
-    """The fields that pictures of its worlds show."""
+    """The fields shown in pictures of the ruleset's worlds."""
     followed = {element.ramp.field for element in ruleset.elements if element.ramp is not None}
     return tuple(sorted(followed | {field.name for field in ruleset.fields if field.tint is not None}))
 
@@ -93,9 +93,9 @@ def _steps(ramp: ColorRamp) -> tuple[NDArray[Any], NDArray[np.uint8]]:
 
 
 def _first_values(change: int, ramp: ColorRamp) -> list[int | float]:
-    """The first values, as the field stores them, at which a channel has changed by 1, 2, … to `change`.
+    """The smallest stored values at which a channel has changed by 1, 2, … up to `change`.
 
-    The j-th change is at the fraction (j - 1/2) / |change| of the range. Where a channel falls, it changes just after.
+    The j-th change is at the fraction (j - 1/2) / |change| of the range. A falling channel changes just after it.
     """
     values: list[int | float] = []
     reaches = operator.ge if change > 0 else operator.gt
@@ -127,15 +127,15 @@ def rgb(
     fields: Mapping[str, Array] | None = None,
     kind: ArrayKind | None = None,
 ) -> Array:
-    """Pictures uint8 [..., H, W, 3] of element ids, a pixel a cell.
+    """Pictures uint8 [..., H, W, 3] of element ids, one pixel per cell.
 
     Args:
         ids: uint8 [..., H, W].
         colors: a `palette`; `looks` has it, the ramps and the tints of a ruleset.
-        ramps: cells of their elements have the color of their value in `fields`.
+        ramps: cells of their elements are colored by their value in `fields`.
         tints: cells are then tinted by vectors in `fields`, in order.
         fields: by name: [..., H, W], or float [..., 2, H, W].
-        kind: of all arrays. Without it, ids and fields may be tensors too, and pictures are NumPy arrays.
+        kind: the kind of all arrays. Without it, ids and fields may also be tensors, and pictures are NumPy arrays.
 
     Raises:
         KeyError: a ramp or a tint follows a field that `fields` lacks.
@@ -158,11 +158,11 @@ def rgb(
 def tint_cells(kind: ArrayKind, image: Array, vectors: Array, tint: CellTint) -> None:
     """Tint pictures uint8 [..., H, W, 3] in place by vectors [..., 2, H, W].
 
-    All operations are in float32, and bytes are truncated, so that all libraries and the page draw the same bytes.
+    All operations use float32, and bytes are truncated, so that all libraries and the page draw the same bytes.
     """
     xp = kind.xp
     vectors = xp.asarray(vectors, dtype=xp.float32)
-    if kind.on_cpu and not bool((vectors != 0).any()):  # on a GPU, the test would wait for it
+    if kind.on_cpu and not bool((vectors != 0).any()):  # on a GPU, the test would synchronize
         return
     row, column = vectors[..., 0, :, :], vectors[..., 1, :, :]
     share = xp.clip(xp.sqrt(row * row + column * column) / tint.full, 0, tint.most)
@@ -174,17 +174,17 @@ def tint_cells(kind: ArrayKind, image: Array, vectors: Array, tint: CellTint) ->
 
 
 def scale(image: NDArray[np.uint8], factor: int) -> NDArray[np.uint8]:
-    """Every pixel of pictures uint8 [..., H, W, 3] as a square of `factor` by `factor`."""
+    """Pictures uint8 [..., H, W, 3] with every pixel enlarged to a square of `factor` by `factor`."""
     return np.repeat(np.repeat(image, factor, axis=-2), factor, axis=-3)
 
 
 def contact_sheet(
     images: Array | Sequence[Array], *, columns: int | None = None, gap: int = 2
 ) -> NDArray[np.uint8]:
-    """Pictures of one size, at least one, uint8 [N, H, W, 3], side by side on one, uint8 [H', W', 3], row by row.
+    """One or more pictures of one size, uint8 [N, H, W, 3], arranged in rows on one picture, uint8 [H', W', 3].
 
     Args:
-        columns: pictures in a row; by default, as many as there are rows, or one more.
+        columns: pictures per row; by default, the number of rows or one more.
         gap: white pixels between and around pictures.
     """
     pictures = [to_numpy(image) for image in images]
@@ -211,7 +211,7 @@ def outline(
 
 def to_numpy(image: Array) -> NDArray[Any]:
     """An array, or a tensor on any device, as a NumPy array."""
-    # `isinstance` would import torch for people who only use arrays.
+    # `isinstance` would import torch even for users of arrays.
     return image.detach().cpu().numpy() if hasattr(image, "detach") else np.asarray(image)
 
 

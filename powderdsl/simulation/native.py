@@ -1,13 +1,13 @@
-"""Native code by the width of grids, compiled when it is worth it.
+"""Native code by the width of grids, compiled when it pays off.
 
-Each width has its own library, or shares one with others (`known_width`). A library is made when the first grid of its
-width is stepped, so that no time is spent on code that is not needed. If the same model was compiled before, its code comes
-from the cache and nothing is lowered. The cache's key depends on the model, on the code of this package, on the compiler,
-the processor and the width. Values of parameters are inputs of a step, so the key excludes them.
+Each width has its own library, or shares one with others (`known_width`). A library is built when the first grid of its
+width is stepped, so that unneeded code takes no time. If the same model was compiled before, its code comes from the
+cache and nothing is lowered. The cache's key depends on the model, on the code of this package, on the compiler, the
+processor and the width. Values of parameters are inputs of a step, so the key excludes them.
 
-The backend `auto` starts on WebAssembly, or on torch where wasmtime has no wheel. Once the work done and requested is
-worth it, a thread compiles. The backend changes between two steps, with the same worlds: long calls are split into slices.
-Short scripts never start a compiler.
+The backend `auto` starts on WebAssembly, or on torch if wasmtime has no wheel. Once enough work is done or requested, a
+thread compiles. The backend changes between two steps, with the same worlds: long calls are split into slices. Short
+scripts never start a compiler.
 """
 
 from __future__ import annotations
@@ -68,11 +68,11 @@ def start_key(ruleset: Ruleset, width: int | None = None) -> str:
 class ByWidth:
     """Native code for each width of grids (`known_width`), made for the first grid of that width.
 
-    Code is built with the settings in effect now. `running` and `notes` describe the width stepped last.
+    Code is built with the current settings. `running` and `notes` describe the last width stepped.
 
     Args:
         segments: returns the ruleset on planes; the first call does the work.
-        first: for `auto`, the backend that starts at once, and a function that returns its program.
+        first: for `auto`, the backend that starts instantly, and a function that returns its program.
         cells: returns the program that runs everything on cells.
 
     Raises:
@@ -117,12 +117,12 @@ class ByWidth:
             return self._programs.setdefault(width, program)
 
     def _recall(self, width: int) -> Runnable | None:
-        """Native code that was compiled before, or None. Raises NoCompiler."""
+        """Cached native code, or None. Raises NoCompiler."""
         code = recall(start_key(self._ruleset, width))
         return None if code is None else NativeProgram(code, self._threads)
 
     def _compile(self, width: int) -> Runnable:
-        """Native code, compiled now or by another process meanwhile. Raises NoCompiler.
+        """Native code, compiled here or meanwhile by another process. Raises NoCompiler.
 
         Passes that do not fit bit planes run on cells.
         """
@@ -167,13 +167,13 @@ def _refusal(error: NoCompiler) -> CompileError:
 
 
 class AutoProgram:
-    """Runs on a backend that starts at once until native code has been compiled.
+    """Runs on a backend that starts instantly until native code has been compiled.
 
     Args:
         name: the backend that starts.
-        first: returns its program, the same at each call.
-        large: returns the program for worlds that do not fit into its memory, if there is no native code.
-        recall: returns native code that was compiled before, or None; raises NoCompiler.
+        first: returns its program, the same on each call.
+        large: without native code, returns the program for worlds that do not fit into its memory.
+        recall: returns cached native code, or None; raises NoCompiler.
         make: compiles native code; raises NoCompiler.
     """
 
@@ -191,7 +191,7 @@ class AutoProgram:
         self._thread: threading.Thread | None = None
         self._starting = threading.Lock()
         self._spent = 0.0
-        self._pace: tuple[int, float] | None = None  # cells of a batch, seconds a step on the first backend
+        self._pace: tuple[int, float] | None = None  # cells of a batch, seconds per step on the first backend
         self._steps = {"first": 0, "native": 0}
         try:
             self._native = recall()
@@ -253,7 +253,7 @@ class AutoProgram:
         return min(left, max(1, int(SLICE / max(self._pace[1], 1e-9))))
 
     def _account(self, cells: int, count: int, left: int, seconds: float) -> None:
-        """Count steps that ran on the first backend, and start to compile once compiling is worth it."""
+        """Count steps that ran on the first backend, and start to compile once it pays off."""
         if count == 0:
             return
         self._steps["first"] += count
@@ -289,7 +289,7 @@ class AutoProgram:
 
 @cache
 def _warn_of_compilers(problem: str) -> None:
-    """Warn once a process if work is worth compiling and there is no compiler. Other problems appear in `notes`."""
+    """Warn once per process if compiling would pay off but there is no compiler. Other problems appear in `notes`."""
     if problem.startswith(MISSING):
         message = f"{problem}; native code is many times faster: {INSTALL}"
         warnings.warn(message, NoCompilerWarning, stacklevel=2)

@@ -1,4 +1,4 @@
-"""Observations of worlds: fields, pictures, the paper's matrix, packed planes, each written into a buffer.
+"""Observations of worlds (fields, pictures, the paper's matrix, packed planes), each written into a buffer.
 
 Worlds that are packed in native memory are read from there; all others are tensors. No observation waits for a GPU.
 """
@@ -27,7 +27,7 @@ from powderdsl.targets.tensor_kind import Tensors, pack, word_count
 State = Mapping[str, Tensor]
 
 SHIFT = 20
-"""Low bits of a float32 that a code of `compact` drops: three bits of the mantissa remain."""
+"""Low bits of a float32 that `compact` drops: three bits of the mantissa remain."""
 
 
 class Channel(NamedTuple):
@@ -52,7 +52,7 @@ class Observer:
         self.device = torch.empty(0, device=device).device  # with its number
         self.slots: dict[str, Slot] = {slot.name: slot for slot in slots(ruleset)}
         self._views: dict[tuple[str, int, int], tuple[NativeProgram, Views]] = {}
-        """By kind, number of cells and bytes of a pixel; of the program that ran last."""
+        """By kind, number of cells and bytes per pixel, for the program that ran last."""
 
     @torch.no_grad()
     def read(self, state: State, name: str, out: Any = None) -> Tensor:
@@ -63,7 +63,7 @@ class Observer:
 
     @torch.no_grad()
     def rgb(self, state: State, out: Any = None, *, size: int = 3) -> Tensor:
-        """Pictures uint8 [B, H, W, 3 to 8], in colors that may follow fields, then tinted. The other bytes are 0."""
+        """Pictures uint8 [B, H, W, 3 to 8], colored by elements and fields, then tinted. The other bytes are 0."""
         out, shown = self.buffer(out, (*shape_of(state), size), torch.uint8), self._looks
         if isinstance(state, PackedState):
             return self._show("rgb", state, out, size)
@@ -73,7 +73,7 @@ class Observer:
 
     @torch.no_grad()
     def matrix(self, state: State, out: Any = None) -> Tensor:
-        """Channels float32 [B, C, H, W], as the ruleset's `matrix:` names them."""
+        """The channels listed in the ruleset's `matrix:`, float32 [B, C, H, W]."""
         batch, height, width = shape_of(state)
         channels, tables = self._channels
         out = self.buffer(out, (batch, len(channels), height, width), torch.float32)
@@ -89,7 +89,7 @@ class Observer:
 
     @torch.no_grad()
     def compact(self, state: State, out: Any = None) -> Tensor:
-        """All fields that last from step to step, as bytes: uint8 [B, C, H, W], in the order of `compact_names`."""
+        """All fields that persist between steps, as bytes: uint8 [B, C, H, W], in the order of `compact_names`."""
         batch, height, width = shape_of(state)
         out = self.buffer(out, (batch, len(self._coded), height, width), torch.uint8)
         if isinstance(state, PackedState):
@@ -110,7 +110,7 @@ class Observer:
         return out
 
     def views(self, kind: str, program: Places, cells: int, size: int = 3) -> Views:
-        """Return what native code writes for ``ids`` or a method's observations, of so many cells and bytes a pixel."""
+        """Return what native code writes for ``ids`` or a method's observations, by cells and bytes per pixel."""
         views, homes = Views(), program.homes
         ids = homes["element"][:2]
         match kind:
@@ -157,7 +157,7 @@ class Observer:
 
     @cached_property
     def compact_values(self) -> Tensor:
-        """The values that the numbers of `compact` stand for: float32 [C, 256]."""
+        """The values of the codes of `compact`: float32 [C, 256]."""
         return torch.stack([_code_values(slot) for _, slot in self._coded]).to(self.device)
 
     @cached_property
@@ -169,8 +169,8 @@ class Observer:
     def matrix_tables(self) -> tuple[tuple[int, ...], Tensor]:
         """The channels of `matrix` in terms of `compact`.
 
-        For each channel, the number of a channel of `compact`; and float32 [n, 256], the value for each byte of that
-        channel. Fields that do not last read as 0.
+        For each channel, the number of a channel of `compact`, and float32 [n, 256], the value of each byte of that
+        channel. Fields that do not persist read as 0.
         """
         channels, tables = self._channels
         names, tables = self.compact_names, tables.clone()
@@ -213,7 +213,7 @@ class Observer:
     def _channels(self) -> tuple[tuple[Channel, ...], Tensor]:
         """The channels of `matrix:`, and a table for each, float32 [C, 256]: the values of elements.
 
-        Tables of channels that are read, and of names that no loaded pack has, are zero.
+        Tables of channels that are read, and of names that no loaded pack defines, are zero.
         """
         channels = []
         tables = torch.zeros(len(self.ruleset.matrix), 256)
@@ -230,7 +230,7 @@ class Observer:
         return tuple(channels), tables.to(self.device)
 
     def buffer(self, out: Any, shape: tuple[int, ...], dtype: torch.dtype) -> Tensor:
-        """`out` if it fits, or a new buffer if it is None. Raises TypeError, ValueError."""
+        """`out` if it is suitable, or a new buffer if it is None. Raises TypeError and ValueError."""
         if out is None:
             return torch.empty(shape, dtype=dtype, device=self.device)
         if not isinstance(out, Tensor):
@@ -239,7 +239,7 @@ class Observer:
             found = f"{out.dtype} {list(out.shape)} on {out.device}"
             raise ValueError(f"out must be {dtype} {list(shape)} on {self.device}, found {found}")
         if shape[0] and not (out[0].is_contiguous() and (shape[0] == 1 or out.stride(0) >= out[0].numel())):
-            rule = "each world of out must be contiguous, and worlds apart"
+            rule = "each world of out must be contiguous, and worlds must not overlap"
             raise ValueError(f"{rule}; found the strides {list(out.stride())}")
         return out
 
@@ -286,9 +286,9 @@ def _write_codes(state: State, slot: Slot, name: str, out: Tensor) -> None:
 def _code_values(slot: Slot) -> Tensor:
     """The values of the 256 codes of a slot: float32 [256].
 
-    Integers in a range of at most 256 are counted from the lowest. Other values have a sign and a size: code 128 is 0,
-    and 128 ± n is ±(x − `_floor`), where x grows by an eighth of a power of two with each n: steps are an eighth of the
-    floor near 0, and at most an eighth of the value far from 0.
+    Integers with at most 256 values are counted from the lowest. Other values have a sign and a magnitude: code 128 is
+    0, and 128 ± n is ±(x − `_floor`), where x grows by an eighth of a power of two with each n. Steps are an eighth of
+    the floor near 0, and at most an eighth of the value far from 0.
     """
     if _is_small(slot):
         return torch.arange(256, dtype=torch.float32) + float(slot.kind.lo)

@@ -25,12 +25,12 @@ if TYPE_CHECKING:
     import torch
 
 WITHOUT_TORCH = ("wasm", "reference")
-"""Backends that need no torch; where it is missing, `auto` is the first one that runs."""
+"""Backends that do not need torch; without torch, `auto` is the first one that runs."""
 
 
 @cache
 def has_torch() -> bool:
-    """True if torch can be imported, and NumPy, which its tensors are made of. They are not imported."""
+    """True if torch can be imported, and NumPy, which creating tensors requires. Neither is imported."""
     try:
         return all(find_spec(name) for name in ("torch", "numpy"))
     except ImportError:
@@ -38,9 +38,9 @@ def has_torch() -> bool:
 
 
 def array_kind(backend: str, device: Any, tensors: bool) -> ArrayKind:
-    """The arrays of a simulator: torch tensors, or `powderdsl.arrays` where torch is missing or not wanted.
+    """The arrays of a simulator: torch tensors, or `powderdsl.arrays` if torch is missing or not requested.
 
-    `tensors`: use torch wherever it is installed, not only where the backend or the device needs it. Without, `auto` is
+    `tensors`: use torch whenever it is installed, not only if the backend or the device needs it. Otherwise, `auto` is
     WebAssembly on the CPU. Raises CompileError (PD701) if the backend or the device is unknown, or needs torch, which
     is missing.
     """
@@ -80,7 +80,7 @@ _WASMTIME = "`pip install wasmtime`, or run on the backend `torch` or `native`"
 
 
 def starting_backend(device: str) -> str:
-    """The backend that runs rules on a torch device at once, without a compiler of C++."""
+    """The backend that runs rules on a torch device instantly, without a C++ compiler."""
     on_cpu = device.partition(":")[0] == "cpu"
     return "torch" if not on_cpu or _wasm_problem() else "wasm"
 
@@ -96,8 +96,8 @@ def make_program(
     | plain   | wasm      | wasm                   | oracle        | oracle      |
     | tensors | others    | the backend            | torch-cells   | torch-cells |
 
-    `auto` is wasm and later native code on the CPU; on other devices cuda, or torch where that is missing; with plain
-    arrays wasm, or the oracle where that is missing. Raises CompileError (PD701) if the backend is not available.
+    `auto` is wasm and later native code on the CPU; on other devices cuda, or torch without it; with plain arrays wasm,
+    or the oracle without it. Raises CompileError (PD701) if the backend is not available.
     """
     device, plain = kind.device, kind.xp.__name__ != "torch"
     problem = _wasm_problem() if backend in ("auto", "wasm") else ""
@@ -115,7 +115,7 @@ def make_program(
     from powderdsl.targets.torch.packed import PlanesProgram
     from powderdsl.targets.torch.program import TorchProgram, packed_program
 
-    # Made on first use: native code that was compiled before needs none of them.
+    # Created on first use: cached native code needs none of them.
     lowered, segments = cache(lambda: lower(ruleset)), cache(lambda: segments_of(ruleset))
     cells, fuse = cache(lambda: TorchProgram(lowered(), device)), backend == "torch-fused"
     make = partial(PlanesProgram, device=device, fuse=fuse)
@@ -148,7 +148,7 @@ def make_program(
 
 @collection_paused()
 def _plain_program(ruleset: Ruleset, kind: ArrayKind, memo: Memo | None) -> Runnable:
-    """WebAssembly without torch: the oracle runs the passes that it cannot."""
+    """WebAssembly without torch: the oracle runs the passes that WebAssembly cannot."""
     return mixed_program(
         segments_of(ruleset, memo),
         lambda program, planes: WasmProgram(program, planes, kind, memo),
@@ -158,21 +158,21 @@ def _plain_program(ruleset: Ruleset, kind: ArrayKind, memo: Memo | None) -> Runn
 
 @cache
 def _wasm_problem() -> str:
-    """The reason why WebAssembly does not run in this process; empty if it runs."""
+    """The reason that WebAssembly does not run in this process; empty if it runs."""
     try:
         this_host()
-    except (ImportError, OSError, RuntimeError) as error:  # wasmtime can be installed where it does not run
+    except (ImportError, OSError, RuntimeError) as error:  # wasmtime may be installed but not run
         return " ".join(str(error).split())[:200] or type(error).__name__
     return ""
 
 
 class BackendProgram(NamedTuple):
-    """The programs of one backend. `name` is the backend that runs, unless `whole` has `running` and `notes`."""
+    """The programs of one backend. `name` is the running backend, unless `whole` has `running` and `notes`."""
 
     name: str
     whole: Runnable
     rest: Callable[[], Runnable] | None = None
-    """Returns the program for chosen passes and given draws, if `whole` cannot run them."""
+    """Returns the program for selected passes and given draws, if `whole` cannot run them."""
 
     def run(self, job: Job) -> Mapping[str, Array]:
         if self.rest is None or (job.passes is None and not job.draws):
@@ -183,7 +183,7 @@ class BackendProgram(NamedTuple):
 class ReferenceProgram:
     """The oracle, which converts the arrays of its jobs to `powderdsl.arrays`.
 
-    `part`: consecutive passes, if only these run. Only the first passes of a step restart fields.
+    `part`: consecutive passes, to run only these. Only the first passes of a step restart fields.
     """
 
     def __init__(self, ruleset: Ruleset, kind: ArrayKind, part: Program | None = None):
@@ -194,7 +194,7 @@ class ReferenceProgram:
         self._bits = {stream.name: stream.bits for stream in ruleset.streams}
 
     def run(self, job: Job) -> Mapping[str, Array]:
-        """The state `job.steps` later. The time before a step's first pass counts for that pass."""
+        """The state after `job.steps` steps. The time before a step's first pass counts toward that pass."""
         host = self._kind.to_numpy
         seed, index, start = map(host, (*job.clock[:2], job.clock.step))
         arrays = {name: host(value) for name, value in job.state.items()}

@@ -1,4 +1,4 @@
-"""Worlds and simulators: state in, state out, on torch tensors or on arrays without torch.
+"""Worlds and simulators, on torch tensors or on arrays without torch.
 
 Worlds are immutable; every method returns a new one. Arrays are in the storage dtypes of `model.state`.
 """
@@ -46,19 +46,19 @@ if TYPE_CHECKING:
 
 MAX_CELLS = 1 << 31
 LAST_STEP = (1 << 63) - 1
-"""The largest number of steps that a world can have made."""
+"""Maximum number of steps of a world."""
 USUAL_SIDE = 400
 BATCH_SIZES = 16
-"""The number of batch sizes whose default parameters are cached."""
+"""Number of batch sizes whose default parameters are cached."""
 
 
 @dataclass(frozen=True, repr=False)
 class World:
-    """A batch of worlds of one ruleset, as arrays of the simulator's kind: torch tensors, or arrays without torch.
+    """A batch of worlds of one ruleset, stored in torch tensors, or in arrays without torch.
 
-    `Simulator.world` makes them. `sim` is their simulator. `state` has one array per slot, [B, H, W] or [B, 2, H, W] in
+    `Simulator.world` creates one. `sim` is its simulator. `state` has one array per slot, [B, H, W] or [B, 2, H, W] in
     the slot's dtype. `seed`, `index` and `step` (int64 [B]) determine the random numbers: equal values give the same
-    future, alone or in any batch. `step` is `since` steps after `start`, and no step of the batch is later than `since`.
+    future, in any batch. `step` is `since` steps after `start`, and no step of the batch is later than `since`.
 
     Raises:
         ValueError: a seed, index or start of another shape, dtype or device.
@@ -86,7 +86,7 @@ class World:
         return f"<World of {self.sim.ruleset.name}: {worlds} of {rows}×{columns} cells at step {steps}>"
 
     def _repr_png_(self) -> bytes:
-        """The picture that a notebook shows."""
+        """The PNG picture shown in notebooks."""
         image, file = self.picture(), BytesIO()
         images = require("PIL.Image", "showing a world", "pip install pillow")
         images.frombytes("RGB", (image.shape[1], image.shape[0]), image.tobytes()).save(file, "PNG")
@@ -94,7 +94,7 @@ class World:
 
     @property
     def step(self) -> Array:
-        """The number of steps that each world has made: int64 [B]."""
+        """The number of steps of each world so far: int64 [B]."""
         return self.start + self.since
 
     @property
@@ -119,13 +119,13 @@ class World:
         """Read a field or property: [B, H, W] in its dtype, or float32 [B, 2, H, W] as (rows, columns) of vectors.
 
         Args:
-            name: plain or qualified.
-            out: a tensor to write to and return, instead of a new tensor or the world's own: of the same shape, dtype
-                and device, each world contiguous.
+            name: its plain or qualified name.
+            out: a tensor to write to and return, of the same shape, dtype and device, with each world contiguous. By
+                default, the result is a new tensor or the world's own.
 
         Raises:
             KeyError: an unknown name.
-            TypeError: `out` is not a tensor, or worlds are not.
+            TypeError: `out` is not a tensor, or the world has no tensors.
             ValueError: `out` does not fit.
         """
         sim = self.sim
@@ -141,22 +141,22 @@ class World:
         return values if out is None else sim.observer.buffer(out, self.shape, values.dtype).copy_(values)
 
     def matrix(self, out: Array | None = None) -> Array:
-        """All channels of the ruleset's `matrix:`: float32 [B, C, H, W], named by `sim.observer.matrix_names`.
+        """The channels of the ruleset's `matrix:`, float32 [B, C, H, W], named by `sim.observer.matrix_names`.
 
-        Elements are one-hot. `out` and errors: as in `read`.
+        Elements are one-hot. `out` and errors are as in `read`.
         """
         return self.sim.observer.matrix(self.state, out)
 
     def rgb(self, out: Array | None = None) -> Array:
-        """Pictures in the elements' colors, a pixel a cell: uint8 [B, H, W, 3]. `out` and errors: as in `read`."""
+        """Pictures in the elements' colors, uint8 [B, H, W, 3], one pixel per cell; see `read`."""
         return self.sim.observer.rgb(self.state, out)
 
     def picture(self, scale: int | None = None, most: int = 16) -> NDArray[np.uint8]:
         """Worlds side by side as one picture, uint8 [H', W', 3]; vectors tint cells as the rules declare.
 
         Args:
-            scale: pixels a cell; by default as many as make a side of about 400.
-            most: how many worlds are shown.
+            scale: pixels per cell; the default gives about 400 pixels per side.
+            most: maximum number of worlds shown.
         """
         ids, rules = self.ids[:most], self.sim.ruleset
         columns = math.ceil(math.sqrt(len(ids)))
@@ -180,22 +180,22 @@ class World:
         return cells.reshape(len(self), -1).sum(-1)
 
     def compact(self, out: Array | None = None) -> Array:
-        """All fields that last from step to step, as bytes: uint8 [B, C, H, W], named by `sim.observer.compact_names`.
+        """All fields that persist between steps, uint8 [B, C, H, W], named by `sim.observer.compact_names`.
 
-        `sim.observer.compact_values` has what they stand for. `out` and errors: as in `read`.
+        `sim.observer.compact_values` has the value of each byte. `out` and errors are as in `read`.
         """
         return self.sim.observer.compact(self.state, out)
 
     def planes(self, out: Array | None = None) -> Array:
-        """The bit planes of flags and integers: int64 [B, P, H, ⌈W/64⌉], named by `Simulator.plane_names`.
+        """The bit planes of flags and integers, int64 [B, P, H, ⌈W/64⌉], named by `Simulator.plane_names`.
 
         Bit x % 64 of word x // 64 is column x; bits beyond the width are zero. Floats have no planes: `read` them.
-        `out` and errors: as in `read`.
+        `out` and errors are as in `read`.
         """
         return self.sim.observer.planes(self.state, out)
 
     def with_state(self, state: Mapping[str, Array], **changes: Any) -> World:
-        """These worlds with another state; `changes` replaces other fields.
+        """These worlds with a new state; `changes` replaces other attributes.
 
         Faster than `dataclasses.replace`, and not checked.
         """
@@ -204,7 +204,7 @@ class World:
         return world
 
     def select(self, worlds: int | slice | Sequence[int] | Array) -> World:
-        """Some worlds of the batch as a new batch; their random futures stay the same.
+        """Select worlds as a new batch; their random futures stay the same.
 
         Args:
             worlds: an index, a slice, indices, or flags, bool [B]. A negative index counts from the end.
@@ -218,11 +218,11 @@ class World:
 
 
 class Simulator:
-    """Runs one ruleset on one backend and device. `powderdsl.compile` makes it and takes the same arguments.
+    """Runs one ruleset on one backend and device. Create it with `powderdsl.compile`, which takes the same arguments.
 
     Attributes:
         ruleset: the checked model.
-        backend: the backend that was asked for; `running` is the one that runs.
+        backend: the requested backend; `running` is the one that runs.
         device: the torch device of its worlds, or ``"cpu"`` without torch.
         kind: the kind of its worlds' arrays: torch tensors, or arrays without torch.
         slot_by_name: the arrays of a world's state, by name.
@@ -244,7 +244,7 @@ class Simulator:
         self.slot_by_name: dict[str, Slot] = {slot.name: slot for slot in slots(ruleset)}
         self._options: dict[str, Any] = {"threads": threads, "tensors": tensors, "memo": memo}
         self._defaults = lru_cache(BATCH_SIZES)(self._default_parameters)
-        """Parameters by batch size: always the same mapping, whose inputs programs cache. It must not change."""
+        """Default parameters by batch size. Programs cache the inputs of these mappings, which must not change."""
         self._program = make_program(ruleset, backend, self.kind, threads, memo)
 
     def __repr__(self) -> str:
@@ -256,7 +256,7 @@ class Simulator:
 
     @property
     def running(self) -> str:
-        """The backend that the next step runs on: for ``auto`` on the CPU, ``wasm`` (or ``torch``) or ``native``."""
+        """The backend of the next step: for ``auto`` on the CPU, ``wasm`` (or ``torch``) or ``native``."""
         return str(getattr(self._program.whole, "running", self._program.name))
 
     @property
@@ -301,19 +301,19 @@ class Simulator:
         return tuple(self.slot_by_name.values())
 
     def fresh_values(self, slot: Slot) -> Array:
-        """The values of a slot in new cells, by element id: of the slot's dtype, [256] or [256, 2]."""
+        """The values of a slot in new cells, by element id, in the slot's dtype: [256] or [256, 2]."""
         return self.kind.put(fresh_values(self.ruleset, slot), slot.dtype)
 
     # Making worlds
 
     def world(self, ids: Any, seed: Any = 0, *, index: Any = None) -> World:
-        """Fresh worlds from element ids.
+        """Create worlds from element ids.
 
         Args:
             ids: integers [B, H, W] or [H, W]; NumPy, torch or nested lists.
-            seed: one integer of 0 or more for all, or one a world.
-            index: the number of each world among those of its seed; by default 0, 1, … for one common seed, 0 for
-                different seeds.
+            seed: an integer of 0 or more for all worlds, or one per world.
+            index: the number of each world among those with its seed; by default 0, 1, … for a common seed, 0 for a
+                list of seeds.
 
         Raises:
             TypeError: ids, seeds or indices are not integers.
@@ -340,7 +340,7 @@ class Simulator:
         return World(self, state, *clock, self.kind.put([0] * batch, "int64"))
 
     def _fresh(self, slot: Slot, ids: Array) -> Array:
-        """A slot's values in new cells of these elements."""
+        """The values of a slot in new cells of these elements."""
         values = self.kind.entries(self.fresh_values(slot), ids)
         return self.kind.contiguous(self.kind.xp.moveaxis(values, -1, 1)) if slot.planes == 2 else values
 
@@ -363,7 +363,7 @@ class Simulator:
         return array
 
     def numbers(self, values: Any, name: str, batch: int) -> Array:
-        """Integers of 0 or more, one for all worlds or one a world, as a new array int64 [B].
+        """Integers of 0 or more, one for all worlds or one per world, as a new array int64 [B].
 
         Raises:
             TypeError: they are not integers.
@@ -381,17 +381,17 @@ class Simulator:
     # Changing worlds
 
     def replace(self, world: World, /, **fields: Any) -> World:
-        """The world with these fields set. New ids make fresh cells; other fields are set after that.
+        """The world with these fields set. New ids create fresh cells; other fields are set afterwards.
 
         Args:
             fields: by plain name, `ids` for the element: [B, H, W] (or [H, W], or one number for all); vectors
-                [B, 2, H, W] as (rows, columns). Floats are cut off at the field's bounds.
+                [B, 2, H, W] as (rows, columns). Floats are clamped to the field's range.
 
         Raises:
             KeyError: an unknown field.
             TypeError: a wrong dtype; worlds whose arrays are of another kind.
-            ValueError: a wrong shape, integers out of range, NaN or infinity, a value where the element cannot hold
-                one, a property that no rule changes, or worlds of other rules.
+            ValueError: a wrong shape, integers out of range, NaN or infinity, a value in cells whose element lacks the
+                field, a property that no rule changes, or a world of other rules.
         """
         self.check(world)
         state, xp = dict(world.state), self.kind.xp
@@ -428,10 +428,10 @@ class Simulator:
             raise ValueError(f"{name} must have the shape {list(target)}, found {found}") from None
 
     def paint(self, world: World, /, *, where: Any, element: str | None = None, **fields: Any) -> World:
-        """Set cells of a mask: fresh cells of an element, and values of fields.
+        """Set the cells of a mask: to an element with fresh fields, to values of fields, or both.
 
         Args:
-            where: bool [B, H, W] or [H, W]; or an index of cells, such as ``(slice(0, 8), slice(0, 8))``, in all worlds.
+            where: bool [B, H, W] or [H, W], or an index of cells in all worlds, such as ``(slice(0, 8), slice(0, 8))``.
             element: the element's name, plain or qualified.
             fields: values by field name; vectors as (rows, columns).
 
@@ -472,15 +472,15 @@ class Simulator:
         params: Mapping[str, Any] | None = None,
         reuse: bool = False,
     ) -> World:
-        """The world some steps later; the argument stays unmodified.
+        """Run some steps and return the new world; the argument is not modified.
 
         Args:
             steps: the number of steps, 0 or more.
-            random: draws that replace random numbers, by stream: [B, H, W] in [0, 1), rounded down to the stream's
+            random: draws to use instead of random numbers, by stream: [B, H, W] in [0, 1), rounded down to the stream's
                 resolution. Every step uses the same draws.
             passes: run only these passes, in the ruleset's order.
-            params: parameter values for this call: one number, or [B] values, one a world.
-            reuse: overwrite the memory of `world`, which must not be used afterwards. Saves a copy.
+            params: parameter values for this call, by name: one number, or one per world [B].
+            reuse: overwrite the memory of `world`, which saves a copy. Do not use `world` afterwards.
 
         Raises:
             KeyError: unknown streams, passes or parameters.
@@ -497,7 +497,7 @@ class Simulator:
         return world.with_state(state, sim=self, since=world.since + steps)
 
     def frames(self, world: World, steps: int, every: int = 1) -> Iterator[World]:
-        """The world at the start, after each `every` steps, and at the end after `steps`."""
+        """Yield the world at the start, every `every` steps, and after `steps` steps."""
         yield world
         for done in range(0, steps, every):
             world = self.step(world, min(every, steps - done))
@@ -548,7 +548,7 @@ class Simulator:
         return {param.name: self.kind.put([float(param.default)] * batch, "float64") for param in params}
 
     def _parameters(self, params: Mapping[str, Any], batch: int) -> Mapping[str, Array]:
-        """As `parameters`, but defaults share memory. Raises KeyError, TypeError, ValueError."""
+        """Like `parameters`, but defaults share memory. Raises KeyError, TypeError, ValueError."""
         values, by_name = self._defaults(batch), {param.name: param for param in self.ruleset.params}
         for name, value in check_mapping("params", params).items():
             if name not in by_name:
@@ -557,9 +557,9 @@ class Simulator:
         return values
 
     def profile(self, world: World, steps: int = 1) -> dict[str, float]:
-        """The seconds that each pass takes over some steps, in order; empty if the backend cannot measure passes.
+        """Measure the seconds of each pass over some steps, in order; empty if the backend cannot measure passes.
 
-        Native code counts processor time on one thread. Raises TypeError and ValueError as `step` does.
+        Native code reports processor time of one thread. Raises TypeError and ValueError as `step` does.
         """
         self.check(world)
         timing, params = PassClock(self.device), self._defaults(len(world))
@@ -581,10 +581,10 @@ def compile(
 
     Args:
         ruleset: from `load`, or a name to load.
-        backend: one of `BACKENDS`; all give the same worlds, bit for bit.
+        backend: one of `BACKENDS`; all compute the same worlds, bit for bit.
         device: a torch device: ``"cpu"``, ``"cuda"``, ``"cuda:1"``.
-        threads: the number of threads of native code, which split a batch. Torch has its own setting.
-        tensors: if true, worlds have torch tensors wherever torch is installed; otherwise, only where the backend or the
+        threads: the number of threads of native code, among which a batch is split. Torch has its own setting.
+        tensors: if true, worlds have torch tensors whenever torch is installed; otherwise, only if the backend or the
             device needs torch.
         memo: a cache of compiled passes, to share between rulesets.
 
@@ -599,7 +599,7 @@ def compile(
 
 
 def _step_count(value: Any, world: World) -> int:
-    """An integer of 0 or more, Python's or NumPy's, that takes no world beyond LAST_STEP. Raises ValueError."""
+    """Return an integer, Python's or NumPy's. Raises ValueError if it is negative or takes a world beyond LAST_STEP."""
     try:
         number = index(value)
     except TypeError:
@@ -607,5 +607,5 @@ def _step_count(value: Any, world: World) -> int:
     if number < 0 or isinstance(value, bool):
         raise ValueError(f"steps must be an integer of 0 or more, found {value!r}")
     if world.since + number > LAST_STEP:
-        raise ValueError(f"step {world.since + number:,} lies beyond {LAST_STEP:,}, the last one")
+        raise ValueError(f"step {world.since + number:,} is beyond the last one, {LAST_STEP:,}")
     return number

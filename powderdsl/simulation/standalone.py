@@ -1,4 +1,4 @@
-"""Standalone WebAssembly modules of rulesets, for pages and games: `powderdsl export`. Needs neither torch nor NumPy."""
+"""Standalone WebAssembly modules of rulesets, for web pages and games (`powderdsl export`), without torch or NumPy."""
 
 from __future__ import annotations
 
@@ -36,14 +36,14 @@ _CELLS = {
     "int32": ("i32.load", 4),
     "float32": ("f32.load", 4),
 }
-"""The instruction that loads a cell, and its bytes."""
+"""The instruction that loads a cell, and its size in bytes."""
 
 
 def standalone_module(ruleset: Ruleset, size: tuple[int, int], memo: Memo | None = None) -> bytes:
-    """The bytes of a module that is a world of `size` (rows, columns), as described in `targets.wasm.standalone`.
+    """The bytes of a module for a world of `size` (rows, columns), as described in `targets.wasm.standalone`.
 
-    `memo` is as in `powderdsl.compile`. Raises CompileError: PD607 if the world is empty or too large, or its sides do
-    not fit the rules, PD702 if the rules have a pass that WebAssembly cannot run.
+    `memo` is as in `powderdsl.compile`. Raises CompileError: PD607 if the rules or the limits do not allow the size,
+    PD702 if WebAssembly cannot run a pass of the rules.
     """
     if not fits(ruleset, size):
         raise failure("PD607", size_problem(ruleset, size))

@@ -1,4 +1,4 @@
-"""Checks of callers' values. Cells are checked in chunks: a check takes many times the memory of the cells."""
+"""Checks of callers' values. Cells are checked in chunks, since a check takes many times their memory."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from powderdsl.model.types import Param, Ruleset
 from powderdsl.targets.array_kind import Array, ArrayKind
 
 CHUNK = 1 << 20
-"""Cells that are checked together."""
+"""Number of cells checked at a time."""
 
 
 def check_mapping(name: str, value: Any) -> Mapping[str, Any]:
@@ -60,10 +60,10 @@ def _flags_by_id(kind: ArrayKind, ids: Iterable[int]) -> Array:
 def checked_values(
     kind: ArrayKind, array: Array, ids: Array, fresh: Array, slot: Slot, ruleset: Ruleset
 ) -> Array:
-    """Values [B, H, W] or [B, 2, H, W] in a slot's dtype, in new memory.
+    """A new array of values [B, H, W] or [B, 2, H, W] in a slot's dtype.
 
-    `ids` are the elements of the cells, some of which may lack the field or property, and `fresh` the values in new cells
-    of these elements. Raises TypeError or ValueError for values that the slot cannot hold, or not in these cells.
+    `ids` are the elements of the cells, some of which may lack the field or property; `fresh` are the values in new
+    cells of these elements. Raises TypeError or ValueError for values that the slot, or these cells, cannot have.
     """
     if kind.sort(array) == "complex":
         raise TypeError(f"{slot.name} takes floats, found {array.dtype}")

@@ -2,9 +2,9 @@
 
 `trace` explains one cell in one step, by the writes of the reference interpreter.
 
-`Recorder` names the rule that last wrote the element of each cell of a batch, on any backend and device. The rules get one
-more field, and every rule that writes an element sets the field to its number in that cell. Backends need no support for
-it, and ordinary simulators do not change.
+`Recorder` finds the rule that last wrote the element of each cell of a batch, on any backend and device. It adds a
+field to the rules, which every rule that writes an element sets to its own number. Backends need no support for it, and
+ordinary simulators do not change.
 """
 
 from __future__ import annotations
@@ -50,15 +50,15 @@ HERE: Offset = (0, 0)
 
 _WITHOUT_RULE = {
     "limit": "no rule: cells of this element keep the field's default",
-    "settle": "no rule: at the end of a pass floats are cut off at their bounds, and tiny ones are zero",
+    "settle": "no rule: at the end of a pass, floats are clamped to their range and tiny ones become zero",
     "reset": "no rule: the field starts each step at its default",
 }
-"""The kinds of writes that have no rule. The others are ``assign``, ``effect``, ``become``, ``leave``, ``arrive``."""
+"""Writes without a rule, by kind. Other kinds: ``assign``, ``effect``, ``become``, ``leave``, ``arrive``."""
 
 
 @dataclass(frozen=True)
 class NumberedRule:
-    """A rule of the checked model. One line of a file makes several rules under loops and symmetries.
+    """A rule of the checked model. With loops and symmetries, one line of a file makes several rules.
 
     `number` counts rules from 1 in the order in which they run; `moment` counts the pass's substeps from 1; `label` has
     the loop variables, such as ``side = left``.
@@ -73,7 +73,7 @@ class NumberedRule:
 
     @property
     def span(self) -> Span:
-        """The rule's place in its file."""
+        """The rule's location in its file."""
         return self.rule.span
 
     @property
@@ -99,8 +99,8 @@ def numbered_rules(ruleset: Ruleset) -> tuple[NumberedRule, ...]:
 class Substep:
     """A recorded substep: the state before it, and its rules. Arrays have a batch of one.
 
-    `rules`, and `masks` of the cells where they happened, are by `id`; `lets` has each `let` so far and the substep that
-    fixed it.
+    `rules`, and `masks` of the cells where they fired, are keyed by `id`; `lets` maps each `let` so far to the substep
+    that fixed it.
     """
 
     policy: str
@@ -110,7 +110,7 @@ class Substep:
     lets: dict[str, tuple[Let, Substep]]
 
     def neighbor_of(self, cell: Cell, offset: Offset, way: int = 1) -> Cell:
-        """The neighbor of a cell, or, with -1, the cell whose neighbor it is; the grid wraps around."""
+        """The neighbor of a cell or, with -1, the cell whose neighbor it is; the grid wraps around."""
         _, height, width = self.at.shape
         return (cell[0] + way * offset[0]) % height, (cell[1] + way * offset[1]) % width
 
@@ -133,12 +133,12 @@ class Attempt:
 
     @cached_property
     def parts(self) -> tuple[Part, ...]:
-        """The condition, split at its `and`s. Flags fixed by `let` are split too, as they were fixed."""
+        """The parts of the condition, split at each `and`. Flags fixed by `let` are split too."""
         return tuple(_split(Part(self.rule.rule.mask, self.substep, self.cell)))
 
     @property
     def failed(self) -> tuple[Part, ...]:
-        """The parts that do not hold. If no part failed, the rule happened, or gave way to another rule."""
+        """The parts that failed. If none did, the rule fired or lost a conflict with another rule."""
         return tuple(part for part in self.parts if not part.holds)
 
     @property
@@ -147,13 +147,13 @@ class Attempt:
 
     @property
     def gave_way(self) -> str | None:
-        """The policy of `conflicts:` under which the rule gave way, or None."""
+        """The policy of `conflicts:` by which the rule lost, or None."""
         return None if self.happened or self.failed else self.substep.policy
 
 
 @dataclass(frozen=True)
 class Change:
-    """A slot of the cell before and after. Values are NumPy numbers, or two numbers of a vector."""
+    """A slot of the cell before and after a write. Values are NumPy numbers, or pairs of them for vectors."""
 
     slot: Slot
     before: Any
@@ -168,7 +168,7 @@ class Change:
 class Write(Change):
     """One write to a slot of the cell, by a rule or by none.
 
-    `source` is the cell from which content moved here.
+    `source` is the cell from which the contents moved here.
     """
 
     how: str
@@ -179,8 +179,8 @@ class Write(Change):
 class RecordedStep:
     """The next step of a batch of one world, with default parameters: its substeps, and all writes to one cell, in order.
 
-    All slots count, including scratch fields. Each write starts from the result of the write before it, and the last
-    result is the step's. States are those of the reference: integers int64, floats float32, [1, H, W] or [1, 2, H, W].
+    All slots are included, even scratch fields. Each write starts from the result of the previous one; the last result
+    is that of the step. States are those of the reference: integers int64, floats float32, [1, H, W] or [1, 2, H, W].
     """
 
     def __init__(self, world: World, cell: Cell):
@@ -202,7 +202,7 @@ class RecordedStep:
         self.substeps.append(substep)
 
     def wrote(self, change: reference.Change, before: Array, after: Array, mask: Array | None = None) -> None:
-        """Record a write to the cell. A write without a rule counts if it changes something."""
+        """Record a write to the cell, if it has a rule or changes something."""
         attempt = source = None
         if change.rule is not None and mask is not None:
             if not mask[(0, *self.cell)]:
@@ -227,10 +227,10 @@ def pick(array: Array, cell: Cell) -> Any:
 
 @dataclass(frozen=True)
 class Read:
-    """One value that a condition read. `cell` is the cell that holds it, None for parameters.
+    """One value that a condition read. `cell` is its cell, None for parameters.
 
-    `value` is plain data, `shown` the notation of a rule file. `element` is the cell's element, if it matters. `counted` are
-    the cells that a count includes.
+    `value` is plain data, `shown` its notation in a rule file. `element` is the cell's element, if relevant. `counted`
+    lists the cells that a count includes.
     """
 
     text: str
@@ -243,9 +243,9 @@ class Read:
 
 @dataclass(frozen=True, eq=False)
 class Part:
-    """One of the conditions that must all hold for a rule to happen, in one cell.
+    """One of the conditions that must all hold in a cell for a rule to fire.
 
-    `substep` has the state that it reads; `let` names the `let` that it comes from.
+    `substep` has the state that it reads; `let` is the `let` that contains it.
     """
 
     expr: Expr
@@ -325,7 +325,7 @@ def _written(name: str) -> str:
 def plain(ruleset: Ruleset, kind: Kind, value: Any) -> Any:
     """A cell's value as plain data: elements and directions by name, other values as numbers.
 
-    JSON has no infinities, which may occur within a pass, so they become text.
+    Infinities, which may occur within a pass, become text, since JSON lacks them.
     """
     if kind.name in ("element", "direction"):
         return show_at_cell(ruleset, kind, value)
@@ -334,7 +334,7 @@ def plain(ruleset: Ruleset, kind: Kind, value: Any) -> Any:
 
 
 def show_at_cell(ruleset: Ruleset, kind: Kind, value: Any) -> str:
-    """A cell's value in the notation of rule files; draws in percent, like chances."""
+    """A cell's value in the notation of rule files; draws are in percent, like chances."""
     number = value.tolist()
     match kind.name:
         case "draw":
@@ -353,8 +353,8 @@ def show_at_cell(ruleset: Ruleset, kind: Kind, value: Any) -> str:
 class Trace:
     """One cell in one step, for some slots.
 
-    `slots` are the slots before and after the step, without scratch fields, which last for one pass. `misses` are rules
-    that would have written the cell, and did not happen.
+    `slots` are the slots before and after the step, without scratch fields, which exist only within a pass. `misses`
+    are rules that would have written the cell but did not fire.
     """
 
     ruleset: Ruleset
@@ -384,13 +384,14 @@ def trace(
     """Explain the values of a cell after a step.
 
     Args:
-        world: the worlds before the first step. All but the last step run on their simulator.
+        world: the batch before the first step. Its simulator runs all steps but the last.
         row: the cell's row, from 0.
         column: its column, from 0.
         step: the number of the step to explain, from 1.
         number: the index of the world in the batch.
-        of: names of slots: the element, fields, scratch fields such as ``pass.name``. All but scratch by default.
-        every_rule: include rules that missed by several parts of their condition, or concern other elements.
+        of: names of slots: the element, fields, and scratch fields such as ``pass.name``. By default, all but scratch
+            fields.
+        every_rule: include rules that failed in several parts of their condition, or concern other elements.
 
     Raises:
         IndexError: the world has no such cell, or the batch no such world.
@@ -435,12 +436,12 @@ def _slots(world: World, names: Iterable[str] | None) -> dict[str, Slot]:
 
 
 def _line(rule: NumberedRule) -> tuple[Span, str]:
-    """A key that is equal for all rules of one line in one pass."""
+    """A key shared by all rules of one line in one pass."""
     return rule.span, rule.pass_name
 
 
 def _misses(step: RecordedStep, slots: Iterable[Slot], every_rule: bool) -> tuple[Attempt, ...]:
-    """Rules that did not happen where they would have written the cell; one a line and cell, unless `every_rule`."""
+    """Rules that would have written the cell but did not fire; one per line and cell, unless `every_rule`."""
     misses: dict[Any, Attempt] = {}
     for substep in step.substeps:
         for numbered in substep.rules.values():
@@ -454,7 +455,7 @@ def _misses(step: RecordedStep, slots: Iterable[Slot], every_rule: bool) -> tupl
 
 
 def _nearly(attempt: Attempt) -> bool:
-    """True if at most one part of a condition failed, other than the test of the cell's element."""
+    """True if at most one part of a condition failed, not counting the test of the cell's element."""
     failed = list(islice((part.expr for part in attempt.parts if not part.holds), 2))
     if len(failed) != 1:
         return not failed
@@ -470,7 +471,7 @@ def _writes_at(rule: Rule, slot: Slot) -> Iterator[Offset]:
 
 
 def _element_writes(rule: Rule) -> list[tuple[bool, Offset]]:
-    """The offsets at which a rule writes elements and their fields; True for arrivals, which come after all else."""
+    """The offsets at which a rule writes elements and their fields; True for arrivals, which are applied last."""
     match rule:
         case Transform():
             return [(False, HERE)]
@@ -484,11 +485,11 @@ def _element_writes(rule: Rule) -> list[tuple[bool, Offset]]:
 # Text
 
 MAX_CELLS = 9
-"""The most cells that a count names in a text."""
+"""Maximum number of cells that a text lists for a count."""
 
 
 def trace_text(trace: Trace, *, color: bool = False) -> str:
-    """The whole trace as text, without a line break at its end. `color`: with the escape codes of terminals."""
+    """The whole trace as text without a final line break. `color`: with terminal escape codes."""
     blocks = [_head(trace)]
     # All writes of one rule in one substep are one block.
     events = groupby(trace.writes, lambda write: (write.attempt, _WITHOUT_RULE.get(write.how)))
@@ -531,7 +532,9 @@ def _miss_text(trace: Trace, miss: Attempt, color: bool) -> str:
     span, failed = miss.rule.span, miss.failed
     labels = [Label(part.expr.span or span, _reads_text(part)) for part in failed]
     if not labels:
-        labels = [Label(span, "all of its condition holds: it gave way to a rule that claims a cell too")]
+        labels = [
+            Label(span, "its whole condition holds, but it lost to another rule that claims the same cell")
+        ]
     elif all(label.span and label.span.line != span.line for label in labels):
         labels.append(Label(span, ""))
     head = _painted("almost" if len(failed) <= 1 else "not", "33;1", color)
@@ -583,7 +586,7 @@ SCHEMA = 1
 def trace_data(trace: Trace) -> dict[str, Any]:
     """The trace as plain data for JSON; docs/tracing.md describes its keys.
 
-    Rows and columns count from 0; steps, lines, columns of text, rules and substeps from 1.
+    Rows and columns are counted from 0; steps, lines, text columns, rules and substeps from 1.
     """
 
     def values(change: Change) -> dict[str, Any]:
@@ -640,7 +643,7 @@ def _place(span: Span | None) -> dict[str, Any]:
 # All cells at once
 
 SLOT = "last writer"
-"""The field of the numbers. Names in rule files have no blanks, so there is no conflict."""
+"""The field of the numbers. Names in rule files have no spaces, so there is no conflict."""
 
 
 @dataclass(frozen=True)
@@ -648,7 +651,7 @@ class Provenance:
     """Worlds after a step, and the rules that wrote their elements.
 
     `numbers` is int16 [B, H, W] on the worlds' device: the number of the rule in `rules` that last wrote the element
-    of a cell in the last step, 0 where none did. A rule that writes the same element again counts too.
+    of a cell in the last step, 0 where none did. Rewriting the same element counts too.
     """
 
     world: World
@@ -662,7 +665,7 @@ class Provenance:
 
 
 class Recorder:
-    """Steps worlds of a simulator and records the rules that wrote their elements. Compiles the rules once more."""
+    """Steps worlds of a simulator and records the rules that wrote their elements. Recompiles the rules once."""
 
     def __init__(self, sim: Simulator):
         self.sim = sim
@@ -695,10 +698,10 @@ def _with_rule_marks(ruleset: Ruleset) -> Ruleset:
             for place, rule in enumerate(moment.rules):
                 number, writes = next(numbers), _element_writes(rule)
                 mark = Expr("const", integer(number, number), value=number)
-                if moment.policy in ("prove", "overwrite"):  # all rules happen where their conditions hold
+                if moment.policy in ("prove", "overwrite"):  # all rules fire where their conditions hold
                     for arrives, at in writes:
                         late.append((arrives, Assign(SLOT, at, ":=", mark, rule.mask, rule.span)))
-                elif not isinstance(rule, Assign):  # of the cells that rules claim each has one writer
+                elif not isinstance(rule, Assign):  # each claimed cell has one writer
                     marks = (Assign(SLOT, at, ":=", mark, TRUE, rule.span) for _, at in writes)
                     rules[place] = replace(rule, effects=(*rule.effects, *marks))
             rules += [mark for _, mark in sorted(late, key=lambda mark: mark[0])]

@@ -1,4 +1,4 @@
-"""Likely meanings of syntax errors: words for what could follow, and the fix for common slips."""
+"""Hints for syntax errors: words for what could follow, and fixes for common slips."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ TERMINAL_WORDS = {
     "_END": "`end`",
     "$END": "the end of the line",
 }
-"""The name of each terminal in messages; keywords, which are missing here, name themselves."""
+"""The name of each terminal in messages, except keywords, which name themselves."""
 
 _VALUE_STARTS = {"NAME", "INTEGER", "LPAR"}
 _LITERALS = {"DECIMAL", "PERCENT", "YES", "NO", "TRUE", "FALSE"}
@@ -57,12 +57,12 @@ _CHARACTERS: tuple[tuple[str, str], ...] = (
     (r"‸≤", "write `<=`"),
     (r"‸≠", "write `!=`"),
     (r"‸×", "write `*`"),
-    (r"‸[\"'“]", "names stand without quotes"),
+    (r"‸[\"'“]", "names are written without quotes"),
     (r"‸:", "assign with `:=`"),
-    (r"‸;", "one line is one rule: put the next one on a line of its own"),
-    (r"‸%", "a percentage is a number and `%`, without a blank; the remainder of a division is `mod`"),
-    (r"‸\^", "powers are written out: `x * x`"),
-    (r"‸#", "a comment needs a blank before its `#`"),
+    (r"‸;", "a line is one rule: put the next one on its own line"),
+    (r"‸%", "a percentage is a number and `%`, without a space; the remainder of a division is `mod`"),
+    (r"‸\^", "there is no power operator: write `x * x`"),
+    (r"‸#", "a comment needs a space before its `#`"),
 )
 """Characters that no rule contains: the line, with an `‸` before the character, and the fix. The first match counts."""
 
@@ -79,7 +79,7 @@ _WORDS = {
     "than": ", then",
     "else": "a if b else c",
 }
-"""Words that people write, and the language's word."""
+"""Words from other languages, and the language's own."""
 
 _LETTERS = (
     "\u0430\u0435\u043e\u0440\u0441\u0443\u0445\u0456\u0458\u0455\u0410\u0412\u0415\u041a\u041c\u041d\u041e\u0420\u0421\u0422\u0425"
@@ -97,9 +97,9 @@ _LOOK_ALIKES = {
     **dict.fromkeys("\u201d\u201e", '"'),
     **dict(zip(_LETTERS, "aeopcyxijsABEKMHOPCTXoavABEHIKMNOPTXi", strict=True)),
 }
-"""Characters that look like others, or like nothing, and the character that is meant."""
+"""Characters that look like others or are invisible, and the intended character."""
 
-CUT = "inside `{…}` and `[…]` YAML ends a value at a comma: quote it, or give it a line of its own"
+CUT = "inside `{…}` and `[…]`, a comma ends a value: quote the value, or put it on its own line"
 
 
 def character_help(text: str, position: int, begin: int) -> str:
@@ -109,8 +109,8 @@ def character_help(text: str, position: int, begin: int) -> str:
         plain = unicodedata.normalize("NFKC", text[position])
         fix = plain if plain.isascii() and plain.isprintable() else None
     if fix is not None:
-        wanted = "a plain blank" if fix == " " else f"`{fix}`" if fix else ""
-        return f"it only looks like {wanted}: type {wanted}" if wanted else "it has no shape: remove it"
+        wanted = "a plain space" if fix == " " else f"`{fix}`" if fix else ""
+        return f"it only looks like {wanted}: type {wanted}" if wanted else "it is invisible: remove it"
     line = f"{text[begin:position]}‸{text[position : position + 2]}"
     return next((fix for pattern, fix in _CHARACTERS if re.search(pattern, line, re.DOTALL)), "")
 
@@ -123,11 +123,11 @@ def was_cut(text: str, begin: int, end: int) -> bool:
 
 _NAME = r"([^\W\d]\w*)"
 _NOT_ELEMENTS = "|".join(_WORDS) + "|is|in|and|or|if|mod|div|not|leaving|then|with|where"
-_WITHOUT_WHERE = "an assignment says `where`: `field := value where condition`"
+_WITHOUT_WHERE = "write the condition of an assignment after `where`: `field := value where condition`"
 _NEXT_LINE = (
     "each rule of a list starts with `- `; a rule that continues on the next line does so with `if`, `and`, …"
 )
-_WITHOUT_LEAVING = "a move says what it leaves behind: `SET moves below leaving ELEMENT if …`"
+_WITHOUT_LEAVING = "a move must name what it leaves behind: `SET moves below leaving ELEMENT if …`"
 
 _PHRASES: tuple[tuple[str, str, str], ...] = (
     (r"\n\s*-\s.*‸", "", "an item of a list starts with `- `: this one, or the one before it, lacks it"),
@@ -136,9 +136,9 @@ _PHRASES: tuple[tuple[str, str, str], ...] = (
     (rf"\b(above|below|left|right|here)\s*‸(?!({_NOT_ELEMENTS})$){_NAME}$", "", r"write `\1 is \3`"),
     (r"\bswaps\s*‸with$", "", "write `swaps PLACE`, without `with`"),
     (rf"^\s*set\s*‸{_NAME}$", "", r"write `\1 := VALUE where …`"),
-    (r"(^|[\s(<>=+*/-])‸\.$", "", "a number has a digit before its point: `0.5`"),
+    (r"(^|[\s(<>=+*/-])‸\.$", "", "write a digit before the decimal point: `0.5`"),
     (r"^\s*(\w+)([+-])\s*‸\2$", "", r"write `\1 \2= 1`"),
-    (r"\*‸\*$", "", "powers are written out: `x * x`"),
+    (r"\*‸\*$", "", "there is no power operator: write `x * x`"),
     (r"\bmoves\s+\S+\s*‸$", "", _WITHOUT_LEAVING),
     (r"\.\.\s*‸$", "", "a range has two ends: `0..99`"),
     (r"‸(:=|\+=|-=)$", "", "only a field of this cell, or of a neighbor, can be assigned"),
@@ -157,24 +157,24 @@ _PHRASES: tuple[tuple[str, str, str], ...] = (
     (r"‸(after|for)$", "WITH", "a field counts steps: `age += 1 where SET`, and `… if age > 3`"),
     (r"‸if$", "WHERE", _WITHOUT_WHERE),
     (r"‸if$", "LEAVING", _WITHOUT_LEAVING),
-    (r"^\s*‸if$", "", "a rule says first what happens: `this -> that if …`"),
-    (r"‸where$", "", "only assignments say `where`; this rule says `if`"),
-    (r" is\s*‸in$", "", "say `is` or `in`, not both"),
-    (r"‸if$", "_ARROW", "say what happens before the `if`: `SET -> ELEMENT if …`"),
+    (r"^\s*‸if$", "", "write the effect of a rule first: `this -> that if …`"),
+    (r"‸where$", "", "only assignments use `where`; write `if` in this rule"),
+    (r" is\s*‸in$", "", "write `is` or `in`, not both"),
+    (r"‸if$", "_ARROW", "write the effect before the `if`: `SET -> ELEMENT if …`"),
     (r"\b(box|ring|disc|diamond|cross|plus)\s*‸(\d+)$", "", r"write `\1(\2)`"),
     (r"/‸/$", "", "integer division, rounded down, is `div`: `a div b`"),
-    (r"->.*‸->$", "", "one line is one rule: put the next one on a line of its own"),
+    (r"->.*‸->$", "", "a line is one rule: put the next one on its own line"),
     (r"‸(.*%)$", "CHANCE", r"write `with chance \1`, at the end of the rule"),
     (r"‸(.*%)$", "WITH", r"write `with chance \1`"),
     (r"chance\s*‸(.*%)$", "", r"write `with chance \1`"),
     (r",\s*‸(?!\))", "THEN", "one line is one rule; effects follow `then`: `…, then field := value`"),
 )
-"""Turns of phrase from other languages, and slips: the line, with an `‸` before the word that cannot follow; a
+"""Phrases from other languages, and slips: the line, with an `‸` before the word that cannot follow; a
 terminal that could have followed; the fix. The first match counts."""
 
 
 def token_help(token: str, accepted: Set[str], before: str, cut: bool) -> str:
-    """The fix for a word that cannot stand where it does. `token` is empty at the end of the line.
+    """The fix for an unexpected word. `token` is empty at the end of the line.
 
     `accepted` are the terminals that could follow, `before` is the line up to the error.
     """

@@ -1,4 +1,4 @@
-"""Text of one line -> syntax tree. Positions are offsets in the whole file, so carets are always right."""
+"""Text of one line -> syntax tree. Positions are offsets in the whole file, so that carets are exact."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ MAX_DEPTH = 48
 
 @dataclass(frozen=True)
 class Syntax:
-    """A node. `kind` is the grammar's rule or alias name; `text` is the token's text of leaves and operators.
+    """A node. `kind` is the grammar's rule or alias name; `text` is the token of leaves and operators.
 
-    Spans take no part in equality, so trees compare by meaning.
+    Equality ignores spans, so trees compare by meaning.
     """
 
     kind: str
@@ -38,7 +38,7 @@ class Syntax:
         return next((child for child in self.children if child.kind == kind), None)
 
     def dump(self, indent: str = "") -> str:
-        """The tree as indented text, one node a line."""
+        """The tree as indented text, one node per line."""
         head = f"{indent}{self.kind}" + (f" {self.text}" if self.text else "")
         return "\n".join([head, *(child.dump(indent + "  ") for child in self.children)])
 
@@ -66,13 +66,13 @@ LANGUAGES = {start: language for language in (RULES, STATEMENTS) for start in la
 
 @cache
 def parser(language: Language = RULES) -> Lark:
-    """The parser of a language. Its tables are kept in the user's cache: making them takes 0.2 s."""
+    """The parser of a language. Its tables, which take 0.2 s to build, are stored in the user's cache."""
     from lark import Lark, __version__
 
     grammar = Path(__file__).with_name("grammar.lark").read_text(encoding="utf-8")
     try:
         cache_file: str | bool = str(cache_folder("syntax") / f"{language.starts[0]}-{__version__}.lark")
-    except (OSError, RuntimeError):  # no home folder, or one that cannot be written
+    except (OSError, RuntimeError):  # no home folder, or one that is not writable
         cache_file = False
     return Lark(
         grammar,

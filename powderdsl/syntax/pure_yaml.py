@@ -1,7 +1,7 @@
 """PyYAML's parser in Python, for systems without libyaml, such as browsers.
 
-Its scanner refuses `?` in plain scalars inside `[…]` and `{…}`, and tabs between tokens, which libyaml accepts. It
-accepts `{key:[value]}`, which libyaml refuses.
+Its scanner rejects `?` in plain scalars inside `[…]` and `{…}`, and tabs between tokens, which libyaml accepts. It
+accepts `{key:[value]}`, which libyaml rejects.
 """
 
 from __future__ import annotations

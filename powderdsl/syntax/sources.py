@@ -1,4 +1,4 @@
-"""Text files as sources: every rule file, scene, task and study is read here."""
+"""Reading text files: every rule file, scene, task and study."""
 
 from __future__ import annotations
 
@@ -14,11 +14,12 @@ MAX_BYTES = 4 * MAX_CHARACTERS
 
 
 OPEN: dict[Path, str] = {}
-"""Texts that are not saved yet, by resolved path: read instead of their files."""
+"""Unsaved texts by resolved path, which are read instead of their files."""
 
 
 def read_source(path: Path, reporter: Reporter, *, limit: int = MAX_BYTES) -> Source | None:
-    """The text of a UTF-8 file, or None after reporting PD101 or PD102. Its name is relative where it lies below here.
+    """The text of a UTF-8 file, or None after reporting PD101 or PD102. Its name is relative if it is below the current
+    folder.
 
     `limit`: bytes that it may have.
     """
@@ -40,25 +41,25 @@ def read_source(path: Path, reporter: Reporter, *, limit: int = MAX_BYTES) -> So
         return None
     try:
         name = str(path.resolve().relative_to(Path.cwd()))
-    except (ValueError, OSError, RuntimeError):  # it lies elsewhere; it is a loop of links
+    except (ValueError, OSError, RuntimeError):  # it is elsewhere, or a loop of links
         name = str(path)
     return Source(name, text)
 
 
 def shipped(folder: str) -> Path:
-    """The folder `rules` or `tasks` that comes with powderdsl, or one below it: in the installed package or the repository."""
+    """A shipped folder, `rules`, `tasks` or one below, in the installed package or the repository."""
     package = Path(__file__).resolve().parents[1]
     installed = package / "data" / folder
     return installed if installed.is_dir() else package.parent / folder
 
 
 def shipped_names(folder: str) -> list[str]:
-    """Names of the YAML files in a folder that comes with powderdsl."""
+    """Names of the YAML files in a shipped folder."""
     return sorted(path.stem for path in shipped(folder).glob("*.yaml"))
 
 
 def find_source(text: str, folder: str, noun: str, reporter: Reporter) -> Source:
-    """A file of a shipped folder by name, or a file by its path. `noun` says what it is, for messages.
+    """A file by name in a shipped folder, or by path. `noun` is its kind, for messages.
 
     Raises CompileError: PD801 for an unknown name, PD101 or PD102 for what cannot be read.
     """
@@ -73,7 +74,7 @@ def find_source(text: str, folder: str, noun: str, reporter: Reporter) -> Source
 
 
 def path_beside(name: str, span: Span, reporter: Reporter) -> Path | None:
-    """The path of a file that a text names at `span`, beside the text's file or below; None after reporting PD112."""
+    """The path of a file named at `span`, in the folder of the text's file or below; None after reporting PD112."""
     try:
         return inside(Path(span.source.name).parent, name)
     except ValueError as error:

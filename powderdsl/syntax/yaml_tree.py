@@ -1,7 +1,7 @@
 """YAML text -> located tree. YAML carries structure only: no tags, anchors, merges, or resolved scalars.
 
-Every node knows its span in the file. Scalars stay text; the schema decides what they mean, so YAML 1.1's
-surprises (`no` as false, `012` as ten, `1:30` as ninety) never happen.
+Every node has its span in the file. Scalars are text, interpreted by the schema, which avoids YAML 1.1's surprises
+(`no` as false, `012` as ten, `1:30` as ninety).
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ MAX_DEPTH = 32
 MAX_NODES = 50_000
 
 _LIBYAML: type | None = getattr(yaml, "CSafeLoader", None)
-"""libyaml's parser, where PyYAML was built with it."""
+"""libyaml's parser, if PyYAML was built with it."""
 _UNPRINTABLE = re.compile("[^\t\n\r -~\x85\xa0-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
 _ESCAPED_TAG = re.compile(r"![^\s!]*%")
 
@@ -40,12 +40,12 @@ class Scalar:
 
     @property
     def word(self) -> str:
-        """The text as a name, without the `?` of one that may be absent."""
+        """The text as a name, without the `?` of an optional one."""
         return self.text.removesuffix("?")
 
     @property
     def is_optional(self) -> bool:
-        """True for a name of a definition that may be absent."""
+        """True for an optional name."""
         return self.text.endswith("?")
 
 
@@ -77,7 +77,7 @@ Node = Scalar | Sequence | Mapping
 
 
 def parse_yaml(source: Source, reporter: Reporter) -> Node | None:
-    """Parse a whole file; None after reporting what is wrong with it."""
+    """Parse a whole file; None after reporting mistakes."""
     text = source.text
     if len(text) > MAX_CHARACTERS:
         notes = [f"{source.name}: a rule file may have {MAX_CHARACTERS:,} characters"]
@@ -88,7 +88,7 @@ def parse_yaml(source: Source, reporter: Reporter) -> Node | None:
     if unprintable:
         at, helps = unprintable.start(), ["remove it"]
         message = f"invalid YAML: the character U+{ord(text[at]):04X} is not allowed"
-        reporter.error("PD103", message, Span(source, at, at + 1), "cannot stand in a text file", helps=helps)
+        reporter.error("PD103", message, Span(source, at, at + 1), "not allowed in a text file", helps=helps)
         return None
     builder = _Builder(source, reporter)
     try:
@@ -109,7 +109,7 @@ def parse_yaml(source: Source, reporter: Reporter) -> Node | None:
 
 
 class _Abort(Exception):
-    """Raised to stop at the first mistake that makes the rest of the document meaningless or dangerous."""
+    """Raised at a mistake that makes the rest of the document meaningless or dangerous."""
 
 
 class _Builder:
@@ -220,15 +220,15 @@ class _Builder:
         return Mapping(tuple(entries), self._collection_span(start, event, last))
 
     def _no_value(self, key: Scalar, *, first: bool) -> None:
-        """Nothing in `{…}` has a key without a value: most often a comma has cut a value in two."""
+        """Report keys without a value in `{…}`, usually because a comma split a value."""
         if self.source.text[key.span.end :].lstrip().startswith(":"):
             label = "nothing follows its `:`"
             fix = 'write its value; one with `#` in it needs quotes: "#RRGGBB"'
         elif first:
-            label, fix = "a key without a `:`", "`{…}` holds `key: value` pairs; rules stand outside braces"
+            label, fix = "a key without a `:`", "`{…}` takes `key: value` pairs; write rules outside it"
         else:
             label = "the comma before it ended the value before it"
-            fix = "put quotes around a value with a comma, or give it a line of its own, outside `{…}`"
+            fix = "put quotes around a value with a comma, or put it on its own line, outside `{…}`"
         self._fail("PD107", f"`{key.text}` has no value", key.span, label, fix)
 
     def _in_braces(self, start) -> bool:  # type: ignore[no-untyped-def]
@@ -239,14 +239,14 @@ class _Builder:
         begin = start.start_mark.index
         if self._in_braces(start):
             return Span(self.source, begin, max(end.end_mark.index, begin + 1))
-        # A block collection's end mark runs to the next token; the last child's end is where a reader sees it end.
+        # A block collection's end mark is at the next token; the visible end is that of its last child.
         return Span(self.source, begin, max(start.end_mark.index, last.end if last else 0, begin + 1))
 
 
-# PyYAML's errors in plain words, with the location and a fix: it reports where its scanner gave up, in its own terms
+# PyYAML's errors in plain words, with the location and a fix: it reports where its scanner gave up
 
 QUOTE = "put quotes around the whole value"
-_STARTS, _MEANING = "a value cannot start with `{}`", "has a meaning of its own in YAML"
+_STARTS, _MEANING = "a value cannot start with `{}`", "has a special meaning in YAML"
 _ENTRY = re.compile(r"\s*(?:- +)?(?P<key>[\w?]+): +(?P<value>[^\"'\s].*?)\s*\Z")
 
 
@@ -307,7 +307,7 @@ def report_yaml(error: yaml.YAMLError, source: Source, reporter: Reporter) -> No
 
 
 def _explain(place: Place, words: str) -> Diagnostic:
-    """The usual mistake behind an error that PyYAML or libyaml reports in some words."""
+    """The usual mistake behind an error message of PyYAML or libyaml."""
 
     def matches(pattern: str) -> bool:
         return re.search(pattern, words) is not None
@@ -343,7 +343,7 @@ def _explain(place: Place, words: str) -> Diagnostic:
         fix = "a key ends with `:`; text that continues is indented deeper than its key"
         return _problem("a line that is neither a key nor a value", span, "no `:` after it", fix)
     if matches("sequence entries are not allowed"):
-        quoted, fix = place.quoted(place.at), "put `- …` on a line of its own"
+        quoted, fix = place.quoted(place.at), "put `- …` on its own line"
         fix += "" if quoted == QUOTE else f"; if it is not a list, {quoted}"
         return _problem("a list on the line of its key", here, "a list starts on the next line", fix)
     if matches("expected (a )?comment or (a )?line break|chomping or indentation"):
@@ -366,7 +366,7 @@ def _explain(place: Place, words: str) -> Diagnostic:
 def _problem(
     message: str, span: Span, label: str = "", fix: str = "", other: Label | None = None
 ) -> Diagnostic:
-    """A diagnostic; `label` finishes the sentence under the caret."""
+    """A diagnostic; `label` is the text under the caret."""
     others, helps = (other,) if other else (), (fix,) if fix else ()
     return Diagnostic("PD103", f"invalid YAML: {message}", Label(span, label), others, helps=helps)
 
@@ -378,7 +378,7 @@ def _second_colon(place: Place) -> Diagnostic:
     start = place.at - len(before.lstrip())
     label = "indented deeper than the line before, or part of it"
     fix = "check the indentation, and that the line before ends as it should: a key with `:`"
-    return _problem("a key that cannot stand here", place.span(start, place.at - start), label, fix)
+    return _problem("a key that is not allowed here", place.span(start, place.at - start), label, fix)
 
 
 def _broken_key(place: Place) -> Diagnostic:

@@ -1,1 +1,1 @@
-"""Tasks: what a world starts as, what an agent may do, for how long, and what counts. See docs/tasks.md."""
+"""Tasks: start worlds, an agent's actions, the length of episodes, and rewards. See docs/tasks.md."""

@@ -1,6 +1,6 @@
-"""The `agent:` and the `expert:` of a task file: the actions it may take, and how a good player acts.
+"""The `agent:` and `expert:` sections of a task file: allowed actions, and a scripted player.
 
-After a mistake has been reported, readers go on with values that are legal: no task comes of a file with mistakes.
+After reporting a mistake, readers continue with legal values; a file with mistakes does not yield a task.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ ACTS = {"blow": BLOW, "nothing": NO_CHANGE}
 """Words of `may:` that are not elements."""
 
 MAX_ACTIONS, MAX_STEPS, MAX_PLANS, MAX_MOVES = 1_000_000, 100_000, 10_000, 256
-"""The most actions of an episode, steps after one, plans of a search, and moves of an expert."""
+"""Maximum numbers of actions of an episode, steps after one, plans of a search, and moves of an expert."""
 
 SPEED = Form(
     r"-?(?![0.]*$)[0-9]{1,7}(\.[0-9]{1,6})?", "a speed: a number other than 0", "such as `20`", read=float
@@ -68,7 +68,7 @@ def read_agent(reader: Reader, decl: AgentDecl, rules: Ruleset, size: Size) -> A
     choices, place = _choices(reader, decl.may, rules), decl.name.span
     blows = BLOW in choices
     if blows and decl.speed is None:
-        message, helps = "an agent that may blow lacks `speed`", ["`speed: 20` is the paper's"]
+        message, helps = "an agent that may blow needs `speed`", ["`speed: 20` is the paper's"]
         reader.reporter.error("PD109", message, place, "how fast?", helps=helps)
     return Agent(
         choices,
@@ -96,7 +96,7 @@ def _choices(reader: Reader, words: Sequence[Scalar], rules: Ruleset) -> tuple[i
 def _speed_field(
     reader: Reader, named: Scalar | None, rules: Ruleset, blows: bool, agent: Span
 ) -> str | None:
-    """The vector that blowing sets: the one named, or the only one there is."""
+    """The vector field that blowing sets: the one named, or the only one."""
     vectors = [field.name for field in rules.fields if field.kind.name == "vec2" and not field.resets]
     if named is not None and slot_name(rules, named.text) in vectors:
         return slot_name(rules, named.text) if blows else None
@@ -131,7 +131,7 @@ def _pair(reader: Reader, node: Node | None, key: str, usual: int, size: Size) -
 def read_expert(
     reader: Reader, node: Node, agent: Agent, size: Size, rules: Ruleset, checker: GoalChecker
 ) -> Expert | None:
-    """The expert of a task, or None after reporting what is wrong with all of it."""
+    """The expert of a task, or None after reporting all mistakes in it."""
     if isinstance(node, yaml_tree.Mapping):
         decl = reader.record(ExpertDecl, node, "an expert")
         return None if decl is None else Expert((), decl.search)
@@ -174,7 +174,7 @@ class _Move:
         self.reader.reporter.error("PD804", message, span, label, helps=helps)
 
     def choice(self, word: Scalar | None) -> int | None:
-        """A place among the agent's choices; None if it is missing, or after a report."""
+        """An index into the agent's choices; None if it is missing, or after a report."""
         if word is None:
             return None
         reporter = self.reader.reporter
@@ -186,13 +186,13 @@ class _Move:
         return self.agent.choices.index(ids[0]) if ids else None
 
     def toward(self, decl: MoveDecl, choice: int | None) -> tuple[int, int]:
-        """Rows and columns; (0, 0) of what does not blow."""
+        """Rows and columns; (0, 0) for moves that do not blow."""
         word = decl.toward
         if choice is None or decl.choose is None:
             return 0, 0
         blows = self.agent.choices[choice] == BLOW
         if blows and word is None:
-            message, helps = "a move that blows lacks `toward`", ["`toward: right`"]
+            message, helps = "a move that blows needs `toward`", ["`toward: right`"]
             self.reader.reporter.error("PD109", message, decl.choose.span, "where?", helps=helps)
         elif word is not None and not blows:
             self.wrong("only `choose: blow` has a direction", word.span, "not used", "remove `toward`")
@@ -206,7 +206,7 @@ class _Move:
         return 0, 0
 
     def place(self, node: Node | None) -> tuple[tuple[int, int] | None, Measure | None]:
-        """The cell, or the cells of which most are looked for; neither after a report."""
+        """The cell, or the cells to count; neither after a report."""
         if node is None:
             return (0, 0), None
         if isinstance(node, yaml_tree.Sequence):
@@ -241,10 +241,10 @@ class _Move:
         condition = self.checker.condition(syntax) if syntax is not None else None
         if condition is None or syntax is None:
             return None
-        # A move knows neither what was before nor the last action.
+        # A move has no access to earlier values or the last action.
         parts = [part for part in parts_of(condition) if part.value not in ("taken", "left")]
         if any(part.op in ("start", "before", "action") for part in parts):
-            message, label = "a move sees the world as it is now", "what was before is not known here"
+            message, label = "a move sees the world as it is now", "earlier values are not available here"
             helps = ["use `count(…)`, `share(…)`, `taken` or `left`"]
             self.reader.reporter.error("PD406", message, syntax.span, label, helps=helps)
             return None

@@ -1,6 +1,6 @@
-"""A task's episodes, stepped by one call of native code: the same as `TaskProgram.act` and what environments do after it.
+"""A task's episodes, stepped by one call of native code, equivalent to `TaskProgram.act` and the environment's part.
 
-`Stepper` lays out what the call reads and writes. Tensors of the episodes are written in place.
+`Stepper` lays out the call's inputs and outputs. Tensors of the episodes are written in place.
 """
 
 from __future__ import annotations
@@ -26,20 +26,20 @@ from powderdsl.tasks.goals import ACTION_WORDS
 from powderdsl.tasks.tensors.measures import Masks
 
 POOL_CELLS = 1 << 22
-"""Cells of the start worlds that are made ahead, about: many small worlds, or few large ones."""
+"""Approximate number of cells of start worlds made ahead: many small worlds, or few large ones."""
 
 MOST_AHEAD, FEW_CELLS = 64, 1 << 16
-"""Start worlds that are made ahead for each episode, at most; more if all have few cells, where a batch is the cost."""
+"""Maximum number of start worlds made ahead per episode; more for few cells, where batch overhead dominates."""
 
 READY, EMPTY = -1, -2
-"""Results of `pd_play`: done, or start worlds have to be made before `pd_begin`."""
+"""Results of `pd_play`: done, or start worlds must be made before `pd_begin`."""
 
 
 _OP = np.dtype([("op", "i8"), ("number", "i8"), ("value", "f8")])
 
 
 def operations(scalar: Expr | None, measures: Mapping[Any, int]) -> Any:
-    """Return the operations of an expression, arguments first; none of None. `measures` numbers those it reads."""
+    """Return the operations of an expression, arguments first (none for None). `measures` numbers the measures."""
     return np.array([] if scalar is None else [*_operations(scalar, measures, "measure")], _OP)
 
 
@@ -61,10 +61,10 @@ def _operations(scalar: Expr, measures: Mapping[Any, int], when: str) -> Iterato
 
 
 class Recycled:
-    """Arrays that are written again once nobody else holds them: fresh memory from the system costs more than a step."""
+    """Arrays to reuse once they are unreferenced, since new memory costs more than a step."""
 
     def watch(self, arrays: list[Any]) -> None:
-        """Count who holds the arrays now: only this object, and views that it holds."""
+        """Count the current references: only this object, and its views."""
         self._arrays = arrays
         self._counts = self._references()
 
@@ -72,17 +72,17 @@ class Recycled:
         return [*map(getrefcount, self._arrays)]
 
     def is_free(self) -> bool:
-        """Return whether nobody else holds an array, or a view of an array."""
+        """Return True if an array or a view of it has no other references."""
         return self._references() == self._counts
 
 
 class Results(Recycled):
-    """What a step gives, a row for each world: see `Results` of episodes.hpp.
+    """The results of a step, one row per world: see `Results` in episodes.hpp.
 
     Args:
         memory: `SIZE` bytes for each world.
         observed: observations, [B, …].
-        last_observed: if they are asked for, the last observations of episodes besides the first ones of the next.
+        last_observed: if requested, the last observations of episodes, in addition to the first ones of the next.
     """
 
     SIZE = 40
@@ -103,13 +103,13 @@ class Results(Recycled):
             **{name: getattr(self, name) for name in names},
         }
         self.final_info |= {f"_{name}": self.ended for name in self.final_info}
-        """What is said of episodes that have ended."""
+        """Infos of ended episodes."""
         self.info: dict[str, Any] = {
             **{name: getattr(self, name) for name in (*names, "world")},
             **dict.fromkeys(("_episode_return", "_episode_length"), self.ended),
             **dict.fromkeys(("_success", "_world"), self.everyone),
         }
-        """What is said of all."""
+        """Infos of all episodes."""
         arrays = [memory, *rows, self.everyone, observed]
         if last_observed is not None:
             arrays.append(last_observed)
@@ -120,17 +120,17 @@ class Results(Recycled):
 
 
 class Plan:
-    """What a step of a task's episodes does, whatever the worlds: `play` without their arrays.
+    """The part of a step that does not depend on the worlds: `play` without their arrays.
 
     Args:
         program: the task.
-        places: where the code of its rules keeps a state.
-        views: what an observation shows, of `size` bytes a world.
+        places: the state's layout in the code of its rules.
+        views: the contents of an observation, of `size` bytes per world.
         mode: the name of an autoreset mode.
         limit: actions after which an episode is truncated.
         last_terminates: whether the task's last action terminates.
-        most: how many values each number of an action has.
-        columns: which of the five numbers they are; or of one number, None.
+        most: the number of values of each number of an action.
+        columns: which of the five numbers they are; None for a single number.
         table: the five numbers of each value of one number, int64 [n, 5].
     """
 
@@ -154,7 +154,7 @@ class Plan:
         self.counts = program.meter.counts(places)
         counted = 0 if self.counts is None else len(self.counts.numbers)
         self.measures_cells = counted < len(program.measures)
-        """Whether some measures are taken of tensors, between two parts of a step."""
+        """True if some measures are computed from tensors, between two parts of a step."""
         self.play = play = Play(
             threads=1,
             steps=agent.steps_per_action,
@@ -191,7 +191,7 @@ class Plan:
             getattr(play, name).count, getattr(play, name).ops = len(steps), self._address(name, steps)
 
     def _address(self, name: str, values: Any) -> int:
-        """Return the address of an array, which is kept by a name."""
+        """Return the address of an array, which is kept alive under a name."""
         if isinstance(values, ctypes.Array):
             self.arrays[name] = values
             return ctypes.addressof(values)
@@ -199,7 +199,7 @@ class Plan:
         return array.ctypes.data
 
     def _fresh_values(self) -> Iterator[Fresh]:
-        """Yield what placed elements set in each slot that travels with them."""
+        """Yield the values that placed elements set in each slot that travels with them."""
         choices = np.array(self.program.task.agent.choices).clip(0)
         for name, table in self.program.hands.blocks.fresh.items():
             values = table.cpu()[choices]
@@ -224,7 +224,7 @@ class Stepper(Plan):
         self._has_maps = False
 
     def bind(self, episodes: Episodes, params: Mapping[str, Tensor], kept: Mapping[str, Tensor]) -> Episodes:
-        """Return the episodes in memory that steps write to from now on.
+        """Return the episodes in memory that later steps write to.
 
         `params` are float64 [B] each, as `TaskProgram.act` takes them; `kept` are an environment's tensors by the names of `Play`, [B] each: ``episode``,
         ``returned``, and ``waiting``, the episodes that are over.
@@ -289,8 +289,8 @@ class Stepper(Plan):
         self.numbers, self._numbers_at = numbers, numbers.ctypes.data
 
     def step(self) -> int:
-        """Step with `numbers`. Returns the place of the first number that is out of range, and nothing
-        has changed; or READY or EMPTY.
+        """Step with `numbers`. Returns READY or EMPTY, or the index of the first number out of range (nothing has
+        changed then).
         """
         library, play, address = self.native.library, self._play, self._numbers_at
         self._state().forget()
@@ -312,19 +312,19 @@ class Stepper(Plan):
         return READY
 
     def begin(self) -> None:
-        """Begin the next episodes where `begins` says so, and write observations."""
+        """Begin the next episodes where `begins` is set, and write observations."""
         self._state().forget()
         self.native.library.pd_begin(self._play)
         self._copy_maps()
 
     def _state(self) -> PackedState:
-        """Return the worlds that the library writes to. Raises RuntimeError if someone has stepped them with `reuse`."""
+        """Return the worlds that the library writes to. Raises RuntimeError if they were stepped with `reuse`."""
         state: PackedState = self.episodes.world.state  # type: ignore[assignment]
         self.play.batch = state.handle
         return state
 
     def _own(self, regions: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        """Return the regions that each world has of its own."""
+        """Return the regions that differ between worlds."""
         return {name: cells for name, cells in regions.items() if name not in self.program.fixed}
 
     def _copy_maps(self) -> None:
@@ -351,7 +351,7 @@ class Stepper(Plan):
     def fill(self, numbers: Callable[[Tensor, Tensor], Tensor]) -> None:
         """Make the start worlds of the next episodes if one that begins lacks its own.
 
-        `numbers` gives the worlds of rows and episodes, int64 [n] each.
+        `numbers` maps rows and episodes to worlds, int64 [n] each.
         """
         worlds = len(self.begins)
         cells = worlds * self.program.task.size[0] * self.program.task.size[1]

@@ -1,4 +1,4 @@
-"""Lists of statements and pictures of a task file -> a checked `Generator`: names known, numbers within bounds."""
+"""Lists of statements and pictures of a task file -> a checked `Generator`, with known names and numbers in range."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ MAX_STATEMENTS = 2_000
 
 @dataclass(frozen=True)
 class Repeat:
-    """Statements that are done `count` times, with names of their own."""
+    """Statements to repeat `count` times, with local names."""
 
     count: Syntax
     lets: Lets
@@ -91,7 +91,7 @@ def read_items(node: yaml_tree.Node | None, reader: Reader, *, nested: bool = Fa
     if node is None or (isinstance(node, yaml_tree.Scalar) and node.text == ""):
         return ()
     if not isinstance(node, yaml_tree.Sequence):
-        reader.shape(node, "a list of statements", "write one `- statement` a line")
+        reader.shape(node, "a list of statements", "write one `- statement` per line")
         return ()
     if not limited(node, MAX_STATEMENTS, "a list of {:,} statements", reporter):
         return ()
@@ -107,11 +107,11 @@ def read_items(node: yaml_tree.Node | None, reader: Reader, *, nested: bool = Fa
         elif not (nested and _is_let(item)):
             word = next(iter(item.entries[0][0].text.split()), "") if item.entries else ""
             if nested and word == "repeat":
-                fix = "repetitions do not stand in repetitions: multiply the counts"
+                fix = "repetitions cannot be nested: multiply the counts"
             elif word == "let":
-                fix = "`let:` stands at the top of the file, or in a repetition"
+                fix = "`let:` belongs at the top level of the file or in a repetition"
             else:
-                fix = "say `48:end` for `48:`, or quote the statement; `repeat 0..5:` has a list below it"
+                fix = "write `48:end` for `48:`, or quote the statement; `repeat 0..5:` needs a list below it"
             not_a_statement(item, reporter, fix)
     return tuple(item for item in items if item is not None)
 
@@ -124,7 +124,7 @@ def _repeat(key: yaml_tree.Scalar, body: yaml_tree.Node, reader: Reader) -> Repe
     """`repeat COUNT:` with a list below it, among whose items `let:` gives names."""
     count = read_line(key.content, "repeat", reader.reporter)
     if isinstance(body, yaml_tree.Scalar) and body.text == "":
-        reader.reporter.error("PD109", "a repetition of nothing", key.span, "no statements stand below it")
+        reader.reporter.error("PD109", "a repetition of nothing", key.span, "no statements below it")
         return None
     lets: list[tuple[Written, Syntax | None]] = []
     for item in body.items if isinstance(body, yaml_tree.Sequence) else ():
@@ -147,7 +147,7 @@ def read_lets(node: yaml_tree.Node | None, reader: Reader) -> list[tuple[Written
 MAX_DRAWINGS = 4_096
 """Drawings of one world, repetitions counted."""
 MAX_VISITS = 100_000
-"""Statements and names of one task's worlds, those of a part each time that a list has it."""
+"""Statements and names of one task's worlds; those of a part count each time a list includes it."""
 
 
 @dataclass(frozen=True)
@@ -169,7 +169,7 @@ class DrawingPlan:
 
 @dataclass
 class Drawer:
-    """Checks one plan. Mistakes go to the reporter; the generator is valid only if there were none."""
+    """Checks one plan. Mistakes go to the reporter; the generator is valid only if there are none."""
 
     plan: DrawingPlan
     ruleset: Ruleset
@@ -253,7 +253,7 @@ class Drawer:
             return ()
         self.used_parts.add(name.text)
         if name.text in inside:
-            self.reporter.error("PD307", f"the part `{name.text}` is made of itself", name.span, "here")
+            self.reporter.error("PD307", f"the part `{name.text}` contains itself", name.span, "here")
             return ()
         return self.groups(self.plan.parts[name.text], (*inside, name.text))
 
@@ -263,7 +263,7 @@ class Drawer:
         place, names = self.count, dict(self.names)
         for word, _ in repeat.lets:
             if word.text in self.names:
-                message = f"`{word.text}` already means something"
+                message = f"`{word.text}` is already in use"
                 self.reporter.error("PD308", message, word.span, "second meaning")
         count = read_amount(repeat.count, self.names, self.reporter)
         lets = self.lets(repeat.lets, names)
@@ -271,7 +271,7 @@ class Drawer:
         for statement in repeat.statements:
             self.count += 1
             if statement.kind == "part":
-                label = "a part cannot stand in a repetition"
+                label = "a part cannot be in a repetition"
                 self.reporter.error("PD605", "a part in a repetition", statement.span, label)
             elif drawing := self.drawing(statement, names):
                 drawings.append(drawing)
@@ -321,7 +321,7 @@ class Drawer:
         return FieldValue(slot, parts, owners_of(slot, self.ruleset)) if slot and parts else None
 
     def covers_something(self, statement: Statement, amounts: tuple[Expr | None, ...]) -> bool:
-        """Return True if the shape can cover a cell; report a shape that never does."""
+        """Return True if the shape can cover a cell; otherwise, report it."""
         never = ""
         for i in range(RANGES.get(statement.kind, 0)):
             start, stop = amounts[2 * i], amounts[2 * i + 1]
@@ -350,7 +350,7 @@ def choice_ids(
         count = read_amount(written, {name: number(value) for name, value in knobs.items()}, Reporter())
         if count is None or count.op != "const" or not 1 <= count.value <= len(ids):
             label = f"a number from 1 to {len(ids)}, or knobs"
-            reporter.error("PD606", "how many of them must be fixed", written.span, label)
+            reporter.error("PD606", "the count must be fixed", written.span, label)
             return ()
         ids = ids[: count.value]
     if not ids and not words:
@@ -381,7 +381,7 @@ class StampDecl(Entry, noun="a stamp"):
 
 
 def read_stamp(decl: StampDecl, reader: Reader, ruleset: Ruleset) -> Stamp:
-    """The picture of a stamp, which changes nothing after a report."""
+    """The picture of a stamp; an empty one after a report."""
     key, art, scene = decl.name, decl.art, decl.scene
     ids: NDArray[np.uint8] | None = None
     try:
@@ -403,10 +403,10 @@ def read_stamp(decl: StampDecl, reader: Reader, ruleset: Ruleset) -> Stamp:
 def _drawn(
     art: yaml_tree.Scalar, decl: StampDecl, reader: Reader, ruleset: Ruleset
 ) -> NDArray[np.uint8] | None:
-    """ASCII art, in which `?` leaves cells as they are."""
+    """ASCII art, in which `?` leaves cells unchanged."""
     for key, _ in decl.legend:
         if len(key.text) != 1:
-            reader.reporter.error("PD110", "a legend has single characters", key.span, "not one character")
+            reader.reporter.error("PD110", "a legend maps single characters", key.span, "not one character")
     legend = {key.text: value.text for key, value in decl.legend if len(key.text) == 1}
     hole = replace(ruleset.elements[0], name="?", pack="?", id=NOTHING, glyph="?")
     elements: list[Element] = [element for element in ruleset.elements if element.id != NOTHING]
@@ -418,7 +418,7 @@ def _drawn(
 
 
 def _named(word: yaml_tree.Scalar, reader: Reader, ruleset: Ruleset) -> NDArray[np.uint8] | None:
-    """A shipped scene, or a file beside the task's: .yaml, .png or .txt."""
+    """A shipped scene, or a file in the task's folder: .yaml, .png or .txt."""
     file, sign, name = word.text.partition("#")
     suffix = Path(file).suffix.lower()
     if suffix in (".png", ".txt", ".yaml", ".yml"):
@@ -439,7 +439,7 @@ def _named(word: yaml_tree.Scalar, reader: Reader, ruleset: Ruleset) -> NDArray[
 
 
 def pass_on(error: CompileError, reporter: Reporter, place: Span) -> None:
-    """Report the mistakes in a file that a task names, those without a place at the name."""
+    """Report the mistakes in a file that a task names; those without a location, at the name."""
     for mistake in error.diagnostics:
         span, label = mistake.primary.span or place, mistake.primary.text
         reporter.error(mistake.code, mistake.message, span, label, notes=mistake.notes, helps=mistake.helps)

@@ -1,4 +1,4 @@
-"""Running tasks: batches of episodes on tensors. Actions in, rewards out, on the simulator's device."""
+"""Running tasks: batches of episodes on tensors, from actions to rewards, on the simulator's device."""
 
 from __future__ import annotations
 
@@ -25,28 +25,28 @@ from powderdsl.tasks.tensors.measures import Facts, Masks, Meter, measures_in, s
 __all__ = ["Episodes", "TaskProgram", "check_actions", "compile_task", "load_task"]
 
 ROWS = ("seed", "acted", "failed", "start", "before")
-"""Tensors of `Episodes`, a row for each."""
+"""Tensors of `Episodes`, one row per episode."""
 
 Params = Mapping[str, Any] | None
 Seen = Callable[[World], None] | None
 
 ACTION = ("x", "y", "choice", "vx", "vy")
-"""What the numbers of an action say."""
+"""The numbers of an action."""
 
 DONE = ("painted", "placed", "blown")
-"""Numbers that `Hands.act` gives for rewards."""
+"""Numbers that `Hands.act` returns for rewards."""
 
 
 @dataclass(frozen=True)
 class Episodes:
     """A batch of episodes.
 
-    `seed`, int64 [B], says which worlds they started as; `acted`, int64 [B], how many actions each has had;
-    `failed`, bool [B], whether `failure` of `end:` holds now. `regions` are bool [B, H, W], or [1, H, W] if all
-    worlds have the same; `targets` uint8 [B, H, W], 255 for no element; `params`, float64 [B] each, the parameters of the
-    rules that each world has drawn; `start` and `before`, float64 [B, n], the
-    measures at the start and after the previous action (not updated if only the last action is rewarded); `masks` are
-    regions and targets as counts of packed worlds read them.
+    `seed`, int64 [B], has the numbers of their start worlds; `acted`, int64 [B], the numbers of actions so far;
+    `failed`, bool [B], is true if `failure` of `end:` holds now. `regions` are bool [B, H, W], or [1, H, W] if all
+    worlds have the same; `targets` uint8 [B, H, W], 255 for no element; `params`, float64 [B] each, the parameters of
+    the rules that each world has drawn; `start` and `before`, float64 [B, n], the measures at the start and after the
+    previous action (not updated if only the last action is rewarded); `masks` are regions and targets as counts of
+    packed worlds read them.
     """
 
     world: World
@@ -65,9 +65,9 @@ class Episodes:
 
 
 class TaskProgram:
-    """A task made executable for one split, with the first `rulesets` of its rulesets (0: all). Made by `compile_task`.
+    """An executable task for one split, with the first `rulesets` of its rulesets (0: all), created by `compile_task`.
 
-    Where the worlds of a split run under different rulesets, episodes belong to the programs that `under` gives.
+    If the worlds of a split run under different rulesets, episodes belong to the programs returned by `under`.
     """
 
     def __init__(
@@ -81,8 +81,7 @@ class TaskProgram:
     ):
         self.task, self.split, self.simulator = task, split, simulator
         self.rulesets, self.ruleset = task.split(split).rulesets[: rulesets or None], ruleset
-        """The rulesets of the split, and the number of the one that this program is under: None if it is under no
-        certain one."""
+        """The rulesets of the split, and the number of this program's ruleset; None if it has no particular one."""
         self._under: dict[int, TaskProgram] = {}
         device = simulator.device
         self._starts = StartWorlds(task, split, simulator.kind)
@@ -95,32 +94,32 @@ class TaskProgram:
         goal = task.goal
         asks_now = (goal.each, goal.success, goal.failure) != (None, None, None)
         self.counts_always = asks_now or any(part.op == "before" for part in scalars)
-        """Whether measures are needed after every action, and not only after the last."""
+        """True if measures are needed after every action, not only after the last."""
         self._asked = {part.value for part in scalars if part.op == "action"}
-        """The numbers of actions that the goal reads."""
+        """The numbers of an action that the goal uses."""
         self.hands = Hands(simulator, task.agent, task.size, counts="painted" in self._asked)
         self.laws = Laws(task, simulator)
         """The laws that observations can show."""
         self.action_nvec = task.agent.action_nvec
-        """How many values x, y, choice, vx and vy have. `Task.agent.choices` says what a choice means."""
+        """The numbers of values of x, y, choice, vx and vy. `Task.agent.choices` lists the choices."""
 
     def __deepcopy__(self, memo: Any) -> TaskProgram:
-        """The same program: nothing in it changes, and copies of what uses it share it."""
+        """Return the same program, which is immutable, so that copies of its users share it."""
         return self
 
     # Rulesets
 
     @property
     def is_mixed(self) -> bool:
-        """True where worlds run under different rulesets: this program cannot run them, those of `under` can."""
+        """True if worlds run under different rulesets, which only the programs of `under` can run."""
         return len(self.rulesets) > 0 and self.ruleset is None
 
     def ruleset_of(self, worlds: Tensor) -> Tensor:
-        """The numbers of the rulesets that worlds run under, int64 [B] of int64 [B]."""
+        """The numbers, int64 [B], of the rulesets of worlds, int64 [B]."""
         return worlds // len(self.task.split(self.split).variants) % max(1, len(self.rulesets))
 
     def under(self, number: int) -> TaskProgram:
-        """The program of the worlds that run under the ruleset of a number, made when it is first asked for.
+        """The program of the worlds under the ruleset with a number, created on first use.
 
         Raises CompileError if the task does not fit that ruleset.
         """
@@ -134,7 +133,7 @@ class TaskProgram:
         return self._under[number]
 
     def apart(self, worlds: Tensor) -> Iterator[tuple[Tensor, TaskProgram]]:
-        """Yield the places of the worlds under each ruleset, int64 [n], and the program of that ruleset."""
+        """Yield the indices of the worlds under each ruleset, int64 [n], and the program of that ruleset."""
         rulesets = self.ruleset_of(worlds)
         for number in rulesets.unique().tolist():
             yield (rulesets == number).nonzero()[:, 0], self.under(number)
@@ -161,7 +160,7 @@ class TaskProgram:
     def restart(self, episodes: Episodes, mask: Tensor, seeds: Tensor, *, reuse: bool = False) -> Episodes:
         """The episodes where `mask`, bool [B], is set, rebuilt as worlds `seeds`, int64 [B]; the others unchanged.
 
-        With `reuse` the tensors of `episodes` are written to, and must not be used afterwards.
+        `reuse` overwrites the tensors of `episodes`, which must not be used afterwards.
         """
         places = mask.nonzero()[:, 0]
         seeds = torch.as_tensor(seeds, dtype=torch.int64, device=self.simulator.device)
@@ -206,7 +205,7 @@ class TaskProgram:
     # Saving
 
     def saved(self, episodes: Episodes) -> dict[str, Any]:
-        """Episodes as plain tensors in dicts, copies on the CPU, that any backend and device can continue from."""
+        """Episodes as dicts of CPU tensors, from which any backend and device can continue."""
         maps = {name: getattr(episodes, name) for name in ("regions", "targets", "params")}
         maps["state"] = episodes.world.state
         return {
@@ -216,7 +215,7 @@ class TaskProgram:
         }
 
     def loaded(self, saved: Mapping[str, Any]) -> Episodes:
-        """The episodes that `saved` was given. Raises KeyError and ValueError for those of other rules or sizes."""
+        """The episodes passed to `saved`. Raises KeyError and ValueError for those of other rules or sizes."""
         device = self.simulator.device
 
         def tensors(values: Mapping[str, Tensor]) -> dict[str, Tensor]:
@@ -248,15 +247,15 @@ class TaskProgram:
         params: Params = None,
         seen: Seen = None,
     ) -> tuple[Episodes, Tensor, Tensor, Tensor]:
-        """One action of each episode, int64 [B, 5] as `check_actions` gives them, and the steps after it.
+        """Take one action in each episode, int64 [B, 5] as returned by `check_actions`, and run the steps after it.
 
         Args:
-            actions: None lets the worlds run as if nobody had acted. The action is spent, and nothing is painted,
-                placed or blown.
-            reuse: the tensors of `episodes` are written to, and must not be used afterwards.
-            params: parameters of the rules for this action, one number each or [B]; NaN leaves what the world drew.
+            actions: None lets the worlds run without an agent. The action counts, but nothing is painted, placed or
+                blown.
+            reuse: overwrite the tensors of `episodes`, which must not be used afterwards.
+            params: parameters of the rules for this action, each a number or [B]; NaN keeps the world's own draw.
             seen: called with the worlds after the action and after each step, which then run one at a time. Free steps
-                are shown where all episodes have them. Not with `reuse`.
+                are shown if all episodes have them. Not allowed with `reuse`.
 
         Returns:
             the episodes; reward float32 [B]; success bool [B], whether `success` of `end:` holds now; over bool [B]:
@@ -305,7 +304,7 @@ class TaskProgram:
 
     @property
     def block_edges(self) -> tuple[Tensor, Tensor]:
-        """The rows, then the columns, of the blocks that actions change: first and past the last, int64 [bins, 2]."""
+        """The rows, then the columns, of the blocks that actions change: first and last + 1, int64 [bins, 2]."""
         return self.hands.blocks.edges
 
     def measured(self, episodes: Episodes, params: Params = None) -> Tensor:
@@ -314,7 +313,7 @@ class TaskProgram:
         return self.meter.take(episodes.world, *places, params_of(episodes, params), episodes.masks)
 
     def _run(self, world: World, steps: int, params: Params, reuse: bool, seen: Seen) -> World:
-        """The worlds after some steps, which run one at a time if they are to be seen."""
+        """The worlds after some steps, run one at a time if `seen` is given."""
         if seen is None:
             return self.simulator.step(world, steps, params=params, reuse=reuse)
         for _ in range(steps):
@@ -340,7 +339,7 @@ class TaskProgram:
 
 
 def params_of(episodes: Episodes, params: Params) -> Params:
-    """The parameters of a step that are not the rules' own: those that worlds have drawn, unless `params` has others."""
+    """The parameters of a step that differ from the rules' own: those drawn by worlds, overridden by `params`."""
     chosen = dict(params or {})
     for name, drawn in episodes.params.items():
         value = torch.as_tensor(chosen.get(name, torch.nan), dtype=torch.float64, device=drawn.device)
@@ -360,13 +359,13 @@ def load_program(
     params: Mapping[str, Any] | None = None,
     **machine: Any,
 ) -> TaskProgram:
-    """The program of a task, for arguments of an environment; a program is returned as it is.
+    """The program of a task, for arguments of an environment; a program is returned unchanged.
 
     `machine`: backend, device and threads, as `compile_task` takes them. Raises CompileError as `compile_task`, and
     ValueError for knobs or parameters of a task that is loaded already.
     """
     if isinstance(task, Task | TaskProgram) and (knobs or params):
-        raise ValueError("knobs and params are given to `load_task` where the task is loaded before")
+        raise ValueError("for a loaded task, pass knobs and params to `load_task`")
     if isinstance(task, str | Path):
         task = load_task(task, knobs=knobs, params=params)
     return compile_task(task, split=split, **machine) if isinstance(task, Task) else task
@@ -393,7 +392,7 @@ def compile_task(
 
 
 def integer_tensor(name: str, values: Any) -> Tensor:
-    """Values from outside as int64. Raises TypeError if they are not integers."""
+    """Convert a caller's values to int64. Raises TypeError if they are not integers."""
     try:
         tensor = torch.as_tensor(values)
     except (TypeError, ValueError, RuntimeError) as error:
@@ -404,7 +403,7 @@ def integer_tensor(name: str, values: Any) -> Tensor:
 
 
 def check_actions(program: TaskProgram, actions: Any) -> Tensor:
-    """Actions from outside as int64 [B, 5] on the program's device; invalid ones are refused.
+    """Convert a caller's actions to int64 [B, 5] on the program's device.
 
     Raises TypeError if they are not integers, ValueError for a wrong shape, or a number out of range, with its index.
     """
@@ -412,14 +411,14 @@ def check_actions(program: TaskProgram, actions: Any) -> Tensor:
 
 
 def check_numbers(actions: Any, nvec: tuple[int, ...], names: tuple[str, ...]) -> Tensor:
-    """Numbers from outside as int64 [B, k], those of column i from 0 to ``nvec[i] − 1``. Raises as `check_actions`."""
+    """Convert a caller's numbers to int64 [B, k], in column i from 0 to ``nvec[i] − 1``. Raises as `check_actions`."""
     tensor = integer_tensor("actions", actions)
     if tensor.ndim != 2 or tensor.shape[1] != len(nvec):
         raise ValueError(f"actions must have the shape [episodes, {len(nvec)}], found {list(tensor.shape)}")
-    numbers = tensor.cpu().numpy()  # NumPy starts an operation on a few numbers in a fraction of torch's time
+    numbers = tensor.cpu().numpy()  # NumPy's overhead for a few numbers is a fraction of torch's
     bad = (numbers < 0) | (numbers >= np.array(nvec))
     if bad.any():
         row, column = np.argwhere(bad)[0].tolist()
         value, most = int(tensor[row, column]), nvec[column] - 1
-        raise ValueError(f"actions[{row}, {column}] ({names[column]}) is {value}: it must lie in 0..{most}")
+        raise ValueError(f"actions[{row}, {column}] ({names[column]}) is {value}: it must be in 0..{most}")
     return tensor

@@ -1,4 +1,4 @@
-"""A task file -> a checked `Task`. Everything that is wrong is reported at once."""
+"""A task file -> a checked `Task`. All mistakes are reported at once."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ class Laws(Record):
 
 
 class Variant(Record):
-    """Changes of a task's worlds."""
+    """Changes to a task's worlds."""
 
     knobs: Node | None = keyed("other values for knobs", shape="mapping")
     let: Node | None = keyed("other values or ranges for names of `let`", shape="mapping")
@@ -125,7 +125,7 @@ Drawn = tuple[dict[str, ParamRange], tuple[tuple[str, ...], ...]]
 """The parameters and the rulesets of a split."""
 
 MAX_VARIANTS = 256
-"""Worlds that the stands of one split may have."""
+"""Maximum number of stands of a split."""
 
 
 def read_task(
@@ -140,8 +140,8 @@ def read_task(
 ) -> Task:
     """The checked task of a file's text; warnings stay with the reporter.
 
-    `packs` are added to its rules, which `rules` replace; `palette` has ids that were recorded. Raises CompileError with
-    everything that is wrong in the file, and in its rules.
+    `packs` are added to its rules, which `rules` replace; `palette` has recorded ids. Raises CompileError with all
+    mistakes in the file and its rules.
     """
     tree = read_tree(source, reporter, "a task starts with `task: NAME`")
     reporter.raise_if_errors()
@@ -170,14 +170,14 @@ def read_task(
 
 
 def task_under(task: Task, rules: Sequence[str]) -> Task:
-    """The same task, read under other rules, as `compiler.load` takes them. Raises CompileError if they do not fit."""
+    """The same task, read under other rules, as for `compiler.load`. Raises CompileError if they do not fit."""
     origin = task.origin
     assert origin is not None
     knobs, params, packs = origin.knobs, origin.params, origin.packs
     try:
         other = read_task(origin.source, Reporter(), knobs=knobs, params=params, packs=packs, rules=rules)
     except CompileError as error:
-        note = f"the split gives worlds the rules {'+'.join(map(str, rules))}"
+        note = f"worlds of the split have the rules {'+'.join(map(str, rules))}"
         raise CompileError(
             [replace(mistake, notes=(*mistake.notes, note)) for mistake in error.diagnostics]
         ) from None
@@ -201,7 +201,7 @@ class _TaskReader:
         self.origin = origin
         own, _ = read(rules[:1], Reporter())
         self.own = {pack.name.text for pack in own}
-        """The packs of the task's own rules: it does not know the names of added ones."""
+        """The packs of the task's own rules: it cannot use names of added packs."""
         self.taken: set[str] = set()
         self.broken: set[str] = set()
 
@@ -235,7 +235,7 @@ class _TaskReader:
         for key, _ in decl.parts.entries if isinstance(decl.parts, yaml_tree.Mapping) else ():
             if key.text in plan.parts and key.text not in used:
                 message = f"the part `{key.text}` is never used"
-                self.reporter.report("PD507", message, key.span, "no list has it", helps=["remove it"])
+                self.reporter.report("PD507", message, key.span, "no list includes it", helps=["remove it"])
         report_unknown_names(self.typer)
         self.reporter.raise_if_errors()
         assert agent is not None
@@ -254,7 +254,7 @@ class _TaskReader:
             self.origin,
         )
 
-    # What worlds are made of
+    # Contents of worlds
 
     def size(self) -> Size:
         node = self.decl.size
@@ -276,7 +276,7 @@ class _TaskReader:
         return ids[0] if ids else 0
 
     def take(self, word: Written) -> None:
-        """Report a new name that already means something, or that statements and expressions need."""
+        """Report a new name that is already in use or reserved."""
         keywords, symbols = reserved_words() | reserved_words(STATEMENTS), self.typer.symbols
         means = self.ruleset.element(word.text) or symbols.constants.get(word.text)
         if word.text in keywords | {*ACTION_WORDS, *FUNCTIONS, *RULE_FUNCTIONS}:
@@ -353,9 +353,9 @@ class _TaskReader:
         for decl in self.decl.splits:
             base = self.varied(plan, decl, decl.name.text)
             if decl.name.text == "train":
-                label = "it is what the task itself says"
+                label = "it is the task itself"
                 helps = ["choose another name, or change `generate`, `let` and `parts` of the task"]
-                message = "the split `train` is there already"
+                message = "the split `train` already exists"
                 self.reporter.error("PD302", message, decl.name.span, label, helps=helps)
             variants = [base] if decl.stands is None else self.stands(base, decl.stands)
             laws = self.params(decl.params, train[0]), self.rulesets(decl.rulesets) or train[1]
@@ -372,7 +372,7 @@ class _TaskReader:
     def params(
         self, entries: Sequence[tuple[Scalar, Scalar]], train: Mapping[str, ParamRange]
     ) -> dict[str, ParamRange]:
-        """The parameters that worlds draw: those of `train` and of some entries, except what was set from outside."""
+        """The parameters that worlds draw: those of `train` and of some entries, except those set by the user."""
         known = {param.name: param for param in self.ruleset.params}
         ranges = dict(train)
         for word, value in entries:
@@ -394,7 +394,7 @@ class _TaskReader:
         return ranges
 
     def rulesets(self, words: Sequence[Scalar]) -> tuple[tuple[str, ...], ...]:
-        """The rules of each word; a range of numbers in it stands for each of them."""
+        """The rules of each word; a range of numbers in a word is expanded."""
         rulesets: list[tuple[str, ...]] = []
         for word in words:
             numbers = NUMBERS.search(word.text)
@@ -402,8 +402,8 @@ class _TaskReader:
             if numbers is not None:
                 first, last = map(int, numbers.groups())
                 if first > last:
-                    message = f"`{numbers[0]}` stands for no rulesets"
-                    self.reporter.error("PD110", message, word.span, "the smaller number comes first")
+                    message = f"`{numbers[0]}` is an empty range"
+                    self.reporter.error("PD110", message, word.span, "write the smaller number first")
                     continue
                 if (total := len(rulesets) + last - first + 1) > MAX_RULESETS:
                     label = f"the limit is {MAX_RULESETS:,}"
@@ -419,11 +419,11 @@ class _TaskReader:
         return tuple(rulesets)
 
     def held_out(self, decl: SplitDecl, train: Drawn, own: Drawn) -> None:
-        """Report laws of a split that training shows too."""
+        """Report laws of a split that training has too."""
         shown = {*train[1]} or {self.rules}
         if decl.rulesets and (common := [rules for rules in own[1] if rules in shown]):
             names = ", ".join("+".join(rules) for rules in common[:3])
-            label, helps = f"{names}: also in `train`", ["choose rules that training does not show"]
+            label, helps = f"{names}: also in `train`", ["choose rules that training does not have"]
             message = f"the split `{decl.name.text}` has {len(common)} rulesets of `train`"
             self.reporter.report("PD807", message, decl.rulesets[0].span, label, helps=helps)
         for word, value in decl.params:
@@ -431,9 +431,9 @@ class _TaskReader:
             usual, drawn = (laws[0].get(name) if name else None for laws in (train, own))
             if usual and drawn and drawn.low <= usual.high and usual.low <= drawn.high:
                 label = f"`train` draws from {usual.low:g}..{usual.high:g}"
-                message = f"the split `{decl.name.text}` draws values of `{word.text}` that `train` draws too"
+                message = f"the ranges of `{word.text}` in `{decl.name.text}` and in `train` overlap"
                 self.reporter.report(
-                    "PD807", message, value.span, label, helps=["choose ranges that are apart"]
+                    "PD807", message, value.span, label, helps=["choose ranges that do not overlap"]
                 )
 
     def stands(self, base: DrawingPlan, node: Node) -> list[DrawingPlan]:
@@ -450,7 +450,7 @@ class _TaskReader:
         return plans
 
     def varied(self, plan: DrawingPlan, decl: Variant, name: str) -> DrawingPlan:
-        """The plan with what a split or stand changes."""
+        """The plan with the changes of a split or stand."""
         knobs = dict(plan.knobs)
         values = {name: number(value) for name, value in plan.knobs.items()}
         for word, syntax in read_lets(decl.knobs, self.reader):
@@ -486,6 +486,6 @@ class _TaskReader:
 
 
 def _qualified(word: Scalar, names: Iterable[str]) -> str | None:
-    """The one of some parameters that a word names, with its pack or without; None if there are none or several."""
+    """The parameter that a word names, with or without its pack; None if there are none or several."""
     fitting = [name for name in names if name == word.text or name.endswith(f".{word.text}")]
     return fitting[0] if len(fitting) == 1 else None

@@ -1,4 +1,4 @@
-"""Reward and end expressions: syntax -> `Expr` of whole worlds, cell conditions checked as those of rules are."""
+"""Reward and end expressions: syntax -> `Expr` of whole worlds. Conditions on cells are checked as in rules."""
 
 from __future__ import annotations
 
@@ -24,19 +24,19 @@ MEASURES = {
     "highest": "highest(CELLS in REGION)",
     "match": "match(TARGET)",
 }
-"""Numbers of a whole world, and how they are written."""
+"""Numbers of a whole world, and their syntax."""
 
 MEMORIES = {"start": "start(VALUE)", "change": "change(VALUE)"}
 ARITHMETIC = {"min": "min(A, B, …)", "max": "max(A, B, …)", "abs": "abs(A)"}
 MAX_VALUES = 8
-"""Numbers that `min` and `max` take, as in rules."""
+"""Numbers of arguments of `min` and `max`, as in rules."""
 FUNCTIONS = {**MEASURES, **MEMORIES, **ARITHMETIC}
 
 ACTION_WORDS = ("taken", "left", "painted", "placed", "blown")
-"""Numbers that describe the last action, and the counts of actions taken and left."""
+"""Numbers that describe the last action, and the numbers of actions taken and left."""
 
 REGION_LET = "in "
-"""How the names of regions begin among the values that cell conditions read."""
+"""The prefix of regions among the values that conditions on cells read."""
 
 
 @dataclass
@@ -54,7 +54,7 @@ class GoalChecker:
         self.scope = Scope("", names)
 
     def number(self, syntax: Syntax) -> Expr | None:
-        """A reward, or None after reporting what is wrong with it."""
+        """A reward, or None after a report."""
         scalar = self._checked(syntax)
         if scalar is not None and not any(part.op in ("measure", "action") for part in parts_of(scalar)):
             label = "it has the same value in every world"
@@ -141,7 +141,7 @@ class GoalChecker:
         raise self._needs_measure(syntax)
 
     def _needs_measure(self, syntax: Syntax) -> Poisoned:
-        """Report a value of each cell, or an unknown name, where one number of the whole world is needed."""
+        """Report a per-cell value, or an unknown name, where one number of the whole world is needed."""
         names = [*ACTION_WORDS, *FUNCTIONS, *self.knobs]
         text = syntax.span.text
         if syntax.kind == "name" and self.typer.find(syntax.text, syntax.span, self.scope) is None:
@@ -150,7 +150,7 @@ class GoalChecker:
             helps = suggest(syntax.text, known)
             message = f"unknown name `{syntax.text}`"
             return self.typer.fail("PD301", message, syntax.span, "not defined", *helps)
-        message, label = "expected one number of the whole world", "this is something of each cell"
+        message, label = "expected one number of the whole world", "this is a value of each cell"
         fix = f"write `count({text})`, or `share({text})`"
         return self.typer.fail("PD401", message, syntax.span, label, fix)
 
@@ -175,14 +175,16 @@ class GoalChecker:
         if name in MEMORIES:
             inner = self.scalar(parts[0])
             if any(part.op in ("start", "before", "action") for part in parts_of(inner)):
-                raise self.typer.fail("PD406", f"`{name}` of what is not a number of a world", parts[0].span)
+                raise self.typer.fail(
+                    "PD406", f"the argument of `{name}` must be a number of a world", parts[0].span
+                )
             if name == "start":
                 return Expr("start", REAL, (inner,))
             return Expr("sub", REAL, (inner, Expr("before", REAL, (inner,))))
         return Expr("measure", REAL, value=self.measure(name, parts[0]))
 
     def measure(self, how: str, cells: Syntax) -> Measure:
-        """The measure of a call such as ``count(SET in REGION)``. Raises Poisoned after reporting what is wrong with it."""
+        """The measure of a call such as ``count(SET in REGION)``. Raises Poisoned after a report."""
         if how == "match":
             if cells.kind != "name" or cells.text not in self.targets:
                 raise self._unknown("target", cells, self.targets)
@@ -201,7 +203,7 @@ class GoalChecker:
         return self.typer.fail("PD802", f"unknown {what} `{word.text}`", word.span, "not defined", *helps)
 
     def cells(self, how: str, syntax: Syntax) -> Expr:
-        """The expression of each cell that a measure is taken of."""
+        """The per-cell expression of a measure."""
         operand = self.typer.evaluate(self.within(syntax), self.scope)
         if how in ("count", "share", "highest"):
             condition = self.typer.flag(operand, syntax.span)
@@ -211,7 +213,7 @@ class GoalChecker:
                 raise self.typer.wrong(value, "a number of each cell", syntax.span, "such as a field")
             condition = value
         if any(part.op == "draw" for part in condition.walk()):
-            raise self.typer.fail("PD406", "a reward draws no random numbers", syntax.span, "a draw")
+            raise self.typer.fail("PD406", "rewards cannot use random numbers", syntax.span, "a draw")
         if condition.op == "const" or (isinstance(operand, SetOf) and not operand.ids):
             label = "every cell fulfills this" if condition.value else "no cell can fulfill this"
             self.typer.reporter.report("PD805", "this never changes", syntax.span, label)
@@ -229,7 +231,7 @@ class GoalChecker:
 
 
 def parts_of(scalar: Expr) -> list[Expr]:
-    """The expression and everything in it, in the order in which measures are kept."""
+    """The expression and its parts, in the order of measures."""
     parts, stack = [], [scalar]
     while stack:
         part = stack.pop()

@@ -1,4 +1,4 @@
-"""A description of the laws that worlds run under: outcomes of small experiments, and the parameters that worlds draw."""
+"""A description of worlds' laws: outcomes of small experiments, and the parameters that worlds draw."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ from powderdsl.simulation.simulator import Simulator
 from powderdsl.tasks.task import Task
 
 SIDE, BLOCK, STEPS, SAMPLES = 16, 4, 8, 4
-"""An experiment: a square of one element in the middle of a world of another; and in how many worlds it is made."""
+"""An experiment: a square of one element in the middle of a world of another, repeated in several worlds."""
 
 NUMBERS = ("down", "right", "inner", "outer")
-"""What an experiment measures: where the square has gone, and how much there is of both elements."""
+"""The measurements of an experiment: the displacement of the square, and the amounts of both elements."""
 
 
 def experiments(simulator: Simulator) -> Tensor:
     """The outcomes of experiments with every pair of elements, in the order of ids: uint8 [pairs · 4].
 
-    127 or 128 is no change: what went `STEPS` cells down or right has 255; of what has doubled there is 255, too.
+    127 or 128 means no change; 255 means a move by `STEPS` cells down or right, or twice the amount.
     """
     pairs = list(permutations(sorted(element.id for element in simulator.ruleset.elements), 2))
     inner, outer = torch.tensor(pairs).repeat_interleave(SAMPLES, 0).T
@@ -42,7 +42,7 @@ def experiments(simulator: Simulator) -> Tensor:
 
 
 class Laws:
-    """Describes the laws of a task's worlds in bytes: experiments, where rulesets differ between worlds, then parameters."""
+    """Encodes the laws of a task's worlds as bytes: experiments, if rulesets differ between worlds, then parameters."""
 
     def __init__(self, task: Task, simulator: Simulator):
         self._simulator, splits = simulator, task.splits
@@ -60,7 +60,7 @@ class Laws:
         return self._tries * self._mixed + len(self._ranges)
 
     def of(self, params: Mapping[str, Tensor], worlds: int) -> Tensor:
-        """The laws of worlds, uint8 [B, n], that run with some parameters, float64 [B] each, and the rules' others."""
+        """The laws of worlds, uint8 [B, n], with some parameters, float64 [B] each, and defaults for the others."""
         if self._mixed and not len(self._experiments):
             self._experiments = experiments(self._simulator)
         defaults = {param.name: float(param.default) for param in self._simulator.ruleset.params}

@@ -1,4 +1,4 @@
-"""Episodes under different rulesets, as one batch to read."""
+"""Episodes under different rulesets, as one read-only batch."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class Playing(Protocol):
 
 
 class MixedWorld:
-    """Worlds of several simulators, in the order of their environments, to draw."""
+    """Worlds of several simulators, in the order of their environments, for drawing."""
 
     def __init__(self, parts: Sequence[World], rows: Sequence[Array]):
         self._parts, self._rows = parts, rows
@@ -39,7 +39,7 @@ class MixedWorld:
 
 
 class MixedEpisodes:
-    """The current episodes of environments, in one order, to read.
+    """The current episodes of environments in one order, read-only.
 
     Args:
         groups: environments, and the numbers of their episodes, int64 [n].

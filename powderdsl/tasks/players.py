@@ -1,4 +1,4 @@
-"""The expert of a task on tensors: scripted moves, or the best of many random plans, found by simulation."""
+"""A task's expert on tensors: scripted moves, or the best of many random plans by simulation."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from powderdsl.tasks.tensors.measures import Facts, Meter, measures_in, scalar_v
 from powderdsl.worlds.raster import mask
 
 SIMULATED = 1024
-"""Episodes that a search simulates at once."""
+"""Number of episodes that a search simulates at once."""
 
 PLANS = 0x506C616E
 """The seed of random plans."""
 
 
 class ExpertPlayer:
-    """Plays the expert of a program's task. A search is made when a world is first seen, and its plan kept.
+    """Plays the expert of a program's task. A search runs when a world first appears; its plan is cached.
 
     Raises ValueError for a task without an expert.
     """
@@ -42,7 +42,7 @@ class ExpertPlayer:
         """Of a search: int64 [actions, 5] by world."""
 
     def under(self, ruleset: int) -> ExpertPlayer:
-        """The player of the worlds under a ruleset, by its number, where they run under different ones."""
+        """The player for each ruleset by number, if worlds run under different ones."""
         if not self.program.is_mixed:
             return self
         if ruleset not in self._under:
@@ -81,7 +81,7 @@ class ExpertPlayer:
         return actions
 
     def _action(self, move: ExpertMove, episodes: Episodes) -> tuple[Tensor, Tensor]:
-        """The action of a move in every episode, int64 [B, 5], and the number of cells that it counts, int64 [B]."""
+        """The action of a move in every episode, int64 [B, 5], and the number of cells counted, int64 [B]."""
         task = self.program.task
         count = torch.full_like(episodes.acted, task.size[0] * task.size[1])
         if move.most is not None:
@@ -101,7 +101,7 @@ class ExpertPlayer:
         return torch.stack([column, row, *other], 1), count
 
     def _fullest(self, cells: Tensor) -> tuple[Tensor, Tensor]:
-        """The bin whose block has most of some cells, bool [B, H, W]; the first of several. int64 [B] each."""
+        """The first bin, int64 [B] each, whose block has most of some cells, bool [B, H, W]."""
         sums = torch.nn.functional.pad(cells.long().cumsum(1).cumsum(2), (1, 0, 1, 0))
         (top, bottom), (left, right) = (edges.T for edges in self.program.block_edges)
         count = sums[:, bottom][:, :, right] - sums[:, top][:, :, right]
@@ -114,8 +114,8 @@ class ExpertPlayer:
 def best_plans(program: TaskProgram, worlds: Tensor, count: int) -> Tensor:
     """The best of `count` random plans in each of some worlds, int64 [n]: int64 [n, actions, 5].
 
-    Every plan is simulated from the world's start; its return decides, and the first of equal plans wins. Plans are
-    hashes of the world and the plan's number.
+    Every plan is simulated from the start of the world. The plan with the highest return wins, the first one if several
+    are equal. Plans are hashes of the world and the plan's number.
     """
     agent, device = program.task.agent, worlds.device
     nvec = torch.tensor(program.action_nvec, device=device)

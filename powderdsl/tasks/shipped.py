@@ -16,16 +16,16 @@ if TYPE_CHECKING:
     from powderdsl.tasks.task import Task
 
 MAX_HEAD = 1 << 16
-"""Bytes of comments that a task's file may begin with."""
+"""Maximum number of bytes of comments at the start of a task's file."""
 
 
 def shipped_tasks() -> list[str]:
-    """Names of the tasks that come with powderdsl."""
+    """Names of the shipped tasks."""
     return shipped_names("tasks")
 
 
 def is_task(name: str) -> bool:
-    """True if a name or path means a task: a shipped one, or a file that begins with ``task:``."""
+    """True if a name or path is that of a task: a shipped one, or a file that begins with ``task:``."""
     if name in shipped_tasks():
         return True
     if not name.lower().endswith((".yaml", ".yml")):
@@ -48,17 +48,17 @@ def load_task(
     palette: Palette | None = None,
     reporter: Reporter | None = None,
 ) -> Task:
-    """A shipped task by name, or a file.
+    """Load a shipped task by name, or a task file by path.
 
     Args:
         knobs: values for knobs of the task.
         params: values for parameters of its rules, by qualified name.
         packs: names or files of packs that are added to its rules.
-        palette: ids that were recorded, as `compiler.load` takes them.
+        palette: recorded ids, as for `compiler.load`.
         reporter: where warnings and notes go.
 
     Raises:
-        CompileError: with everything that is wrong.
+        CompileError: all mistakes in the files.
     """
     from powderdsl.tasks.file import read_task
 
@@ -71,7 +71,7 @@ def load_task(
 
 
 def load_task_with_diagnostics(name_or_path: str | Path, **how: Any) -> tuple[Task, tuple[Diagnostic, ...]]:
-    """Like `load_task`; the second value has the warnings and notes."""
+    """Like `load_task`, and also return the warnings and notes."""
     reporter = Reporter()
     task = load_task(name_or_path, reporter=reporter, **how)
     return task, tuple(
@@ -80,7 +80,7 @@ def load_task_with_diagnostics(name_or_path: str | Path, **how: Any) -> tuple[Ta
 
 
 def check_split(task: Task, split: str) -> None:
-    """Raises CompileError (PD801) for a split that the task does not have."""
+    """Raise CompileError (PD801) for a split that the task does not have."""
     names = [split.name for split in task.splits]
     if split not in names:
         helps = suggest(split, names, "splits") or ("splits: " + ", ".join(names),)

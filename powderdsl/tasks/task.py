@@ -1,6 +1,6 @@
-"""The checked task: resolved, ranges known, knobs filled in. Frozen; no torch, no NumPy but in stamps.
+"""The checked task, with names resolved and knobs filled in. Frozen, without torch, and without NumPy except in stamps.
 
-`tasks.file.read_task` makes it from a file; `generator` and `episodes` run it.
+`tasks.file.read_task` creates it from a file; `generator` and `episodes` run it.
 """
 
 from __future__ import annotations
@@ -16,27 +16,27 @@ from powderdsl.system.settings import UNMEANING
 from powderdsl.worlds.raster import Shape, Size
 
 BLOW = -1
-"""Among the choices of an agent: blow, instead of placing an element."""
+"""A choice of an agent: blow instead of placing an element."""
 
 NO_CHANGE = -2
-"""Among the choices of an agent: leave the world as it is."""
+"""A choice of an agent: do nothing."""
 
 MAX_SIDE = 1024
-"""Rows or columns of a task's worlds."""
+"""Maximum number of rows or columns of a task's worlds."""
 
 MAX_NUMBER = 4096
-"""Rows, columns, widths and radii of generated shapes lie within ±MAX_NUMBER."""
+"""Rows, columns, widths and radii of generated shapes are within ±MAX_NUMBER."""
 
 MAX_REPEATS = 256
-"""Repetitions of one group."""
+"""Maximum number of repetitions of a group."""
 
 NOTHING = 255
-"""In stamps and targets: no element. A stamp leaves such a cell as it is."""
+"""In stamps and targets: no element. A stamp leaves such a cell unchanged."""
 
 
 @dataclass(frozen=True)
 class Knob:
-    """An integer that is set from outside: ``--knob lines=8``. `value` is what it is in this task."""
+    """An integer that users can set: ``--knob lines=8``. `value` is its value in this task."""
 
     name: str
     default: int
@@ -49,7 +49,7 @@ class Knob:
 
 @dataclass(frozen=True)
 class FieldValue:
-    """A field, and the value that a drawing gives it in cells of `owners`; None stands for all elements."""
+    """A field, and the value that a drawing sets in cells of `owners` (None: all elements)."""
 
     slot: Slot
     parts: tuple[float, ...]
@@ -60,9 +60,9 @@ class FieldValue:
 class Drawing:
     """One statement of a generator.
 
-    `number` is its place among all statements and enters the hash of its draws. `amounts` stand in the order of
-    `worlds.scene.statements.SHAPES`; None is an open end. One of `ids` is drawn uniformly, in the order given.
-    Only cells of the region `where` are painted, and only if they hold one of `over`.
+    `number` is its index among all statements and part of the hash of its draws. `amounts` are in the order of
+    `worlds.scene.statements.SHAPES`; None is an open end. One of `ids` is drawn uniformly, in the order given. Only
+    cells of the region `where` that contain one of `over` are painted.
     """
 
     number: int
@@ -78,7 +78,7 @@ class Drawing:
 
 @dataclass(frozen=True)
 class Group:
-    """Drawings that are made `count` times in a row (a number of repetitions that may be drawn), with own names."""
+    """Drawings repeated `count` times (a number that may be drawn), with local names."""
 
     number: int
     count: Expr
@@ -95,7 +95,7 @@ class Region:
     name: str
     shapes: tuple[Drawing, ...]
     drawn: bool
-    """Whether it depends on draws, so that every world has its own."""
+    """True if it depends on draws, so that it differs between worlds."""
 
 
 @dataclass(frozen=True)
@@ -108,7 +108,7 @@ class Stamp:
 
 @dataclass(frozen=True)
 class Target:
-    """A picture that worlds can be compared with: what its drawings paint, and nothing where they do not."""
+    """A picture to compare worlds with: the painted cells of its drawings, and NOTHING elsewhere."""
 
     name: str
     groups: tuple[Group, ...]
@@ -116,7 +116,7 @@ class Target:
 
 @dataclass(frozen=True)
 class Generator:
-    """A recipe for start worlds: `fill` everywhere, then all groups in order. `lets` are draws that everything shares."""
+    """A recipe for start worlds: `fill` everywhere, then all groups in order. `lets` are shared draws."""
 
     name: str
     fill: int
@@ -129,7 +129,7 @@ class Generator:
 
 @dataclass(frozen=True)
 class ParamRange:
-    """A parameter of the rules that each world draws: uniformly from `low` to `high`; integers if `whole`."""
+    """A parameter of the rules that each world draws uniformly from `low` to `high`; an integer if `whole`."""
 
     name: str
     low: float
@@ -139,7 +139,7 @@ class ParamRange:
 
 @dataclass(frozen=True)
 class Split:
-    """A set of worlds, their start and their laws. Fixed scenes are variants.
+    """A set of worlds: their start states and laws. Fixed scenes are variants.
 
     World n comes from variant ``n mod len(variants)``, and runs under ruleset ``n div len(variants) mod len(rulesets)``.
     """
@@ -149,17 +149,16 @@ class Split:
     variants: tuple[Generator, ...]
     params: tuple[ParamRange, ...] = ()
     rulesets: tuple[tuple[str, ...], ...] = ()
-    """Rules as `compiler.load` takes them; if there are none, all worlds have the task's own."""
+    """Rules as for `compiler.load`; if empty, all worlds have the task's own."""
 
 
 @dataclass(frozen=True)
 class Agent:
-    """The actions that an agent may take, and how many.
+    """The actions that an agent may take, and their number.
 
-    An action is (x, y, choice, vx, vy). The block of `brush` (rows, columns) cells around the center of bin
-    (y, x) of `bins` (rows, columns) is filled with the element ``choices[choice]``; where that is BLOW, its cells get
-    the motion ``speed · (vy − 1, vx − 1)`` as (rows, columns) in the field `speed_field`; where it is
-    NO_CHANGE, nothing happens.
+    An action is (x, y, choice, vx, vy). The block of `brush` (rows, columns) cells around the center of bin (y, x) of
+    `bins` (rows, columns) is filled with the element ``choices[choice]``. For BLOW, its cells get the motion ``speed ·
+    (vy − 1, vx − 1)`` as (rows, columns) in the field `speed_field`; for NO_CHANGE, nothing happens.
     """
 
     choices: tuple[int, ...]
@@ -170,7 +169,7 @@ class Agent:
     """Actions of an episode."""
     steps_per_action: int
     free_steps: int
-    """Steps that run inside the last action, after its own."""
+    """Further steps that run as part of the last action."""
     speed_field: str | None
     speed: float
 
@@ -181,16 +180,16 @@ class Agent:
         return columns, rows, len(self.choices), 3, 3
 
     def first_line(self, axis: int, place: Any, side: int) -> Any:
-        """The first row (axis 0) or column of the brush at bins `place`, integers or tensors; perhaps outside the grid."""
+        """The first row (axis 0) or column of the brush at bins `place`, integers or tensors; may be outside the grid."""
         return (2 * place + 1) * side // (2 * self.bins[axis]) - self.brush[axis] // 2
 
 
 @dataclass(frozen=True)
 class Measure:
-    """A number taken of a whole world.
+    """A number computed from a whole world.
 
     `how` is ``count sum mean share highest`` of the cell expression `value` over a region (all cells if None), or
-    ``match``: the share of a target's cells that hold its element.
+    ``match``: the share of a target's cells that contain its element.
     """
 
     how: str
@@ -203,13 +202,13 @@ class Measure:
 class Goal:
     """Rewards and ends of episodes. `each` is given after every action, `final` with the last; conditions end an episode early.
 
-    Each is arithmetic on one number a world: the arithmetic, comparisons and logic of `model.operations.OPS`, and
+    Each is arithmetic on one number per world: the arithmetic, comparisons and logic of `model.operations.OPS`, and
     ``measure`` (value: Measure), ``action`` (value: ``taken``, ``left``, ``painted``, ``blown``, ``placed``), ``start``
     and ``before`` (the argument at the start, and after the previous action). Conditions are 0 or 1; x / 0 is 0; ``mod``
     has two arguments.
 
-    `shaped` is no part of what the task means: a reward after every action, in place of `each` and `final`, that agents
-    may be trained on. See `Task.with_shaped_reward`.
+    `shaped` is not part of the task's definition: it is a reward after every action that can replace `each` and `final`
+    in training. See `Task.with_shaped_reward`.
     """
 
     each: Expr | None
@@ -240,10 +239,11 @@ class ExpertMove:
 
 @dataclass(frozen=True)
 class Expert:
-    """A scripted player. Before each action the first move that applies is played; a move applies if its condition
-    holds and enough cells of `most` exist. The last move always applies.
+    """A scripted player. Before each action, it plays the first move whose condition holds and for which enough cells
+    of `most` exist. The last move always applies.
 
-    If `search` is not 0, there are no moves: that number of random plans is simulated in each world, and the best is played.
+    If `search` is not 0, there are no moves: that many random plans are simulated in each world, and the best is
+    played.
     """
 
     moves: tuple[ExpertMove, ...]
@@ -252,14 +252,14 @@ class Expert:
 
 @dataclass(frozen=True)
 class Origin:
-    """The file and the settings that a task was read from, to read it again under other rules."""
+    """The file and settings of a task, to read it again under other rules."""
 
     source: Source
     knobs: Mapping[str, int]
     params: Mapping[str, Any]
     packs: tuple[str, ...]
     shaped: bool = False
-    """Whether its `shaped` reward has taken the place of the others."""
+    """True if its `shaped` reward has replaced the others."""
 
 
 @dataclass(frozen=True)
@@ -276,20 +276,20 @@ class Task:
     splits: tuple[Split, ...]
     expert: Expert | None = field(default=None, metadata=UNMEANING)
     rules: tuple[str, ...] = field(default=(), compare=False, repr=False)
-    """The rules that were loaded, as `compiler.load` takes them."""
+    """The loaded rules, as for `compiler.load`."""
     family: str = field(default="", metadata=UNMEANING)
-    """A word for tasks of one kind; empty if the file has none."""
+    """The kind of task; empty if the file has none."""
     origin: Origin | None = field(default=None, compare=False, repr=False)
 
     def with_shaped_reward(self) -> Task:
-        """The same task with its `shaped` reward: worlds, actions and ends stay. Raises ValueError if it has none."""
+        """The same task with its `shaped` reward instead of the others. Raises ValueError if it has none."""
         if self.goal.shaped is None:
             raise ValueError(f"the task {self.name} has no `shaped` reward")
         goal = replace(self.goal, each=self.goal.shaped, final=None, shaped=None)
         return replace(self, goal=goal, origin=self.origin and replace(self.origin, shaped=True))
 
     def is_held_out(self, split: Split) -> bool:
-        """Return whether all worlds of a split have rules, or a value of some parameter, that no world of `train` has."""
+        """Return True if all worlds of a split have rules, or a parameter's value, that no world of `train` has."""
         train = self.split("train")
         if split.rulesets and not {*split.rulesets} & ({*train.rulesets} or {self.rules}):
             return True
@@ -298,7 +298,7 @@ class Task:
         return any(own.low > trained.high or own.high < trained.low for own, trained in pairs)
 
     def split(self, name: str) -> Split:
-        """The split of a name. Raises KeyError."""
+        """The split with a name. Raises KeyError."""
         for split in self.splits:
             if split.name == name:
                 return split
@@ -306,7 +306,7 @@ class Task:
 
 
 def still_action(task: Task) -> tuple[int, int, int, int, int]:
-    """The action ``nothing``; if agents lack it but can blow, blowing still air into the first bin.
+    """The action ``nothing`` or, for agents without it that can blow, a blow without speed in the first bin.
 
     Raises ValueError if the task has neither.
     """

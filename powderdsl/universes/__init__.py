@@ -1,7 +1,8 @@
-"""Lawful universes: rule packs with invented elements and laws, each made of a seed and the pieces in `rules/universes/`.
+"""Generated universes: rule packs with invented elements and laws, made from a seed and the pieces in
+`rules/universes/`.
 
-The same seed gives the same text, on every machine. What is written here is correct by construction: no reaction goes up in
-rank, so that nothing grows without end, and the pack claims what follows from that.
+The same seed gives the same text, on every machine. Packs are correct by construction: no reaction increases the rank,
+so that nothing grows forever, and the pack claims the consequences.
 """
 
 from __future__ import annotations
@@ -17,17 +18,17 @@ PREFIX = "universe:"
 
 
 def is_universe(word: str) -> bool:
-    """True for names of universes, also of those that there are not, such as ``universe:x``."""
+    """True for names of universes, including invalid ones such as ``universe:x``."""
     return word.startswith(PREFIX)
 
 
 def universe_source(word: str, span: Span | None, reporter: Reporter) -> Source | None:
-    """The pack that a name such as ``universe:7`` means; None after reporting PD304."""
+    """The pack with a name such as ``universe:7``; None after reporting PD304."""
     number = word.removeprefix(PREFIX)
     seed = int(number) if re.fullmatch("[0-9]{1,10}", number) else -1
     if 0 <= seed <= MAX_SEED:
         return Source(f"{PREFIX}{seed}", universe_text(seed))
-    label = f"a number from 0 to {MAX_SEED:,} follows the colon" if span else ""
+    label = f"expected a number from 0 to {MAX_SEED:,} after the colon" if span else ""
     helps = [f"write a number from 0 to {MAX_SEED}, as in `{PREFIX}7`"]
     reporter.error("PD304", f"no universe `{number[:80]}`", span, label, helps=helps)
     return None

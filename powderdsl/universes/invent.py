@@ -1,4 +1,4 @@
-"""A seed -> the text of a universe, made of the pieces in `rules/universes/laws.yaml`, which explains their form."""
+"""A seed -> the text of a universe, made from the pieces in `rules/universes/laws.yaml`, which explains their form."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from powderdsl.system.random import MASK, START_0, mix
 T = TypeVar("T")
 Pieces = Mapping[str, Any]
 Phrase = tuple[str, str]
-"""What rules say, and what people say."""
+"""The word for rules, and the word for people."""
 
 MAX_SEED = 0xFFFFFFFF
 PLACE = re.compile(r"<(\w+)(?: (\w+))?>")
@@ -27,7 +27,7 @@ RANGE = re.compile(r"(\w+)([+-]\d+)?\.\.(\w+)([+-]\d+)?")
 
 @cache
 def pieces() -> Pieces:
-    """The pieces that universes are made of."""
+    """The pieces of universes."""
     source = read_source(shipped("rules") / "universes" / "laws.yaml", reporter := Reporter())
     tree = parse_yaml(source, reporter) if source else None
     reporter.raise_if_errors()
@@ -46,7 +46,7 @@ def plain(node: Node) -> Any:
 
 @dataclass
 class Draws:
-    """Choices that depend on a seed, and on how many there were before."""
+    """Choices that depend on a seed and the number of earlier choices."""
 
     seed: int
     count: int = 0
@@ -65,7 +65,7 @@ class Draws:
         return [rest.pop(self.below(len(rest))) for _ in range(len(rest))]
 
     def within(self, text: str, known: Mapping[str, int] | None = None) -> int:
-        """A number of a range such as ``2..7``, or ``2..pool-1``, where `known` says what names are."""
+        """A number in a range such as ``2..7``, or ``2..pool-1`` with names from `known`."""
         match = RANGE.fullmatch(text)
         assert match is not None, text
         values = {**(known or {}), **{word: int(word) for word in match.group(1, 3) if word.isdecimal()}}
@@ -75,7 +75,7 @@ class Draws:
 
 @dataclass
 class Universe:
-    """A universe as far as it has been drawn."""
+    """A partly drawn universe."""
 
     draws: Draws
     pieces: Pieces
@@ -84,13 +84,13 @@ class Universe:
     tags: dict[str, str] = field(default_factory=dict)
     """The tags of elements that no other has, by part."""
     levels: dict[str, int] = field(default_factory=dict)
-    """How high parts stand; reactions turn what is higher into what is not."""
+    """The ranks of parts; reactions never turn a part into a higher one."""
     params: list[str] = field(default_factory=list)
     passes: dict[str, list[str]] = field(default_factory=dict)
     sentences: list[str] = field(default_factory=list)
 
     def law(self, law: Pieces, name: str, given: Mapping[str, str] | None = None) -> None:
-        """Add a law, if there is something to which it applies. `given`: the parts that some letters stand for."""
+        """Add a law if it applies to something. `given`: the parts of some letters."""
         chosen = dict(given or {})
         for letter, choice in law.get("draws", {}).items():
             if not (parts := [*self.candidates(choice, chosen)]):
@@ -110,7 +110,7 @@ class Universe:
             self.passes[name] = self.block("pass", name=name, about=self.sentences[-1], body=body)
 
     def candidates(self, choice: str, chosen: Mapping[str, str]) -> Iterable[str]:
-        """The parts of a group, or those that stand below, above or level with the part of a letter."""
+        """The parts of a group, or those below, above or level with the part of a letter."""
         group, _, letter = choice.partition(" ")
         parts: list[str] = self.pieces["groups"][group]
         if letter:
@@ -120,7 +120,7 @@ class Universe:
         return (part for part in parts if part not in chosen.values())
 
     def block(self, piece: str, **values: str | list[str]) -> list[str]:
-        """The lines of a piece. Lists take the place of the lines that name them alone."""
+        """The lines of a piece. Lists replace the lines that consist of their name."""
         lines: list[str] = []
         for line in self.pieces[piece].splitlines():
             alone = PLACE.fullmatch(line.strip())
@@ -139,7 +139,7 @@ class Words:
     universe: Universe
     name: str
     own: Mapping[str, str]
-    """The chances that are named after themselves, and the number of the law; others are named after the law."""
+    """The chances with their own names, and the number of the law; others are named after the law."""
     known: dict[str, Phrase] = field(default_factory=dict)
 
     def filled(self, text: str, form: int = 1) -> str:

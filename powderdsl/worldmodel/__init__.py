@@ -1,7 +1,7 @@
-"""World models: networks that learn to predict a world some steps later (Frans & Isola 2023, section 4).
+"""World models: networks that learn to predict a world some steps ahead (Frans & Isola 2023, section 4).
 
-`worlds` makes the data, or reads transitions with actions. `networks` has the paper's network; `training`,
-`evaluation` and `scores` take that network or any other: a callable from ids uint8 [B, H, W] to logits [B, slots, H, W].
+`worlds` generates the data, or reads transitions with actions. `networks` has the paper's network; `training`,
+`evaluation` and `scores` take that network or any callable from ids uint8 [B, H, W] to logits [B, slots, H, W].
 """
 
 from __future__ import annotations

@@ -11,11 +11,11 @@ from powderdsl.model.composition.compose import MAX_ELEMENTS
 from powderdsl.system.settings import check_settings, checked_record, setting
 
 TEST_SEEDS = 1 << 32
-"""The first seed of worlds that models are tested on. Training takes seeds below it."""
+"""The first seed of test worlds. Training uses seeds below it."""
 
 
 class Checked:
-    """Settings that are checked when they are made."""
+    """Settings that are checked when they are created."""
 
     def __post_init__(self) -> None:
         check_settings(self)
@@ -23,36 +23,34 @@ class Checked:
 
 @dataclass(frozen=True)
 class DataConfig(Checked):
-    """The pairs that a network learns from. Plain values: ``dataclasses.asdict`` gives what a run's file keeps.
+    """The pairs that a network learns from. Plain values, which ``dataclasses.asdict`` converts for a run's file.
 
-    The worlds are those of seeds 0 to `states` − 1. Each is run for `steps`·`pairs` steps and gives `pairs` pairs: the
-    paper's 16 of 8 steps. `only` names packs: worlds draw no other pack's elements. The replay buffer holds `capacity`
-    pairs, of which each iteration replaces `refresh`; if all pairs of all worlds fit in, it holds these and stays so.
+    The worlds have seeds 0 to `states` − 1. Each runs for `steps`·`pairs` steps and gives `pairs` pairs (in the paper,
+    16 of 8 steps). `only` names the packs whose elements worlds draw. The replay buffer contains `capacity` pairs, of
+    which each iteration replaces `refresh`; if all pairs of all worlds fit, it is never changed.
     """
 
     task: str = setting("world-model", form="a name or a file")
     split: str = setting("train", "Split of the task to train on.  [default: train]", form="a name")
     rules: str = setting("")
-    """As everywhere: a shipped ruleset, packs joined by ``+``, left out behind ``-``. Empty: the task's own."""
+    """A shipped ruleset, or packs joined by ``+`` or left out by ``-``. Empty: the task's own."""
     only: tuple[str, ...] = setting(())
     knobs: Mapping[str, int] = setting(dict)
     params: Mapping[str, Any] = setting(dict)
-    states: int = setting(
-        1_000_000, "How many worlds there are to draw from.", 1, TEST_SEEDS, option="worlds"
-    )
+    states: int = setting(1_000_000, "Number of worlds to draw from.", 1, TEST_SEEDS, option="worlds")
     steps: int = setting(8, low=1)
     pairs: int = setting(16, low=1)
-    rulesets: int = setting(0, "Use only the first rulesets of the split, this many; 0: all.", 0, 4096)
+    rulesets: int = setting(0, "Use only the first N rulesets of the split; 0: all.", 0, 4096)
     capacity: int = setting(1024 * 256, "Capacity of the buffer, in pairs.", 1, 1 << 32, option="buffer")
-    refresh: int = setting(256, "Pairs that each iteration replaces in the buffer.", 1, 1 << 20)
+    refresh: int = setting(256, "Pairs of the buffer that each iteration replaces.", 1, 1 << 20)
 
 
 @dataclass(frozen=True)
 class Recorded:
-    """The dataset of a run with actions: its digest, and what its numbers mean. See `recordings`.
+    """The dataset of a run with actions: its digest, and the meaning of its numbers. See `recordings`.
 
-    `channels` are those of its observations, `steps` those of an action, `speed` the one that blowing gives to cells.
-    Without `actions` the network does not see them.
+    `channels` are those of its observations, `steps` those of an action, `speed` that of blowing. Without `actions`,
+    the network does not see them.
     """
 
     digest: str
@@ -64,35 +62,35 @@ class Recorded:
 
 @dataclass(frozen=True)
 class TrainConfig(Checked):
-    """Everything that decides the weights (on one kind of device). The defaults are the paper's.
+    """All settings that determine the weights (on one kind of device). The defaults are the paper's.
 
-    `parent` is the name of the checkpoint that a fine-tuned network starts from; without it weights are random.
-    `palette` has the qualified name of the element of each of the network's slots, or None; empty: those of the task's
-    and the data's rules. `slots` is how many there are at least: free ones are room for packs that come later.
-    `network` is the name of a `CustomNetwork`, as text: what it names is imported only if the user gives it again.
-    `recorded` is the dataset that is learned from; `data` then says which task it was recorded from.
+    `parent` is the name of the checkpoint that a fine-tuned network starts from; without it, weights are random.
+    `palette` has the qualified name of the element of each of the network's slots, or None; if empty, those of the
+    task's and the data's rules. `slots` is their minimum number: free ones leave room for packs added later. `network`
+    is the name of a `CustomNetwork` as text, which is imported only if the user passes it again. `recorded` is the
+    dataset to learn from; `data` then describes the task that it was recorded from.
     """
 
     data: DataConfig = field(default_factory=DataConfig)
-    width: int = setting(32, "Features of the first block.", 1, 1024)
-    iterations: int = setting(5000, "Steps of Adam.", 1, 1 << 40)
+    width: int = setting(32, "Number of features of the first block.", 1, 1024)
+    iterations: int = setting(5000, "Number of Adam steps.", 1, 1 << 40)
     batch: int = setting(256, "Pairs per step.", 1, 1 << 20)
     learning_rate: float = setting(0.005, "Learning rate of Adam.", 1e-300, 1e300)
-    seed: int = setting(0, "Seed of weights, worlds and batches.", 0, 2**63 - 1)
+    seed: int = setting(0, "Seed of the weights, worlds and batches.", 0, 2**63 - 1)
     parent: str | None = None
-    slots: int = setting(0, "Room for this many elements, for packs that come later.", 0, MAX_ELEMENTS)
+    slots: int = setting(0, "Number of element slots, to leave room for packs added later.", 0, MAX_ELEMENTS)
     palette: tuple[str | None, ...] = ()
     network: str | None = None
     recorded: Recorded | None = None
 
     @property
     def plain(self) -> dict[str, Any]:
-        """The settings that are used, as ``run.json`` has them."""
+        """The settings in use, as in ``run.json``."""
         return {name: value for name, value in asdict(self).items() if value is not None}
 
     @staticmethod
     def of(values: Mapping[str, Any]) -> TrainConfig:
-        """The configuration in a run's JSON, without its palette and what is no setting. Raises ValueError."""
+        """The configuration in a run's JSON, without its palette and other entries. Raises ValueError."""
         names = {field.name for field in fields(TrainConfig)} - {"palette"}
         return checked_record(TrainConfig, {name: values[name] for name in values if name in names})
 
@@ -108,7 +106,7 @@ PRESETS = {
 
 @dataclass(frozen=True)
 class Machine(Checked):
-    """The device and storage of a run. A run may continue on another machine.
+    """The device and storage of a run, which may resume on another machine.
 
     `store` is that of `Replay`.
     """
@@ -120,7 +118,7 @@ class Machine(Checked):
 
     @property
     def simulation(self) -> dict[str, Any]:
-        """The settings that `TaskWorlds` takes."""
+        """The settings for `TaskWorlds`."""
         return {"device": self.device, "threads": self.threads, "backend": self.backend}
 
 

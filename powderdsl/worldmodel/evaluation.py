@@ -1,4 +1,4 @@
-"""Tests of trained networks on worlds that training never uses: compared with baselines, and as pictures."""
+"""Tests of trained networks on unseen worlds: comparisons with baselines, and pictures."""
 
 from __future__ import annotations
 
@@ -24,34 +24,34 @@ from powderdsl.worldmodel.training import Trained, check_slots, load_rules_of
 from powderdsl.worldmodel.worlds import Pairs, Recording, TaskWorlds, pairs_of, unseen_seeds
 
 FIT_WORLDS = 64
-"""The most training worlds that baselines are fitted on."""
+"""Maximum number of training worlds to fit baselines on."""
 
 TRANSITIONS = 2048
-"""The most recorded transitions that a network is tested on, and that baselines are fitted on."""
+"""Maximum number of recorded transitions to test a network on, and to fit baselines on."""
 
 MODEL, STILL, FREQUENT = "model", "nothing changes", "most frequent outcome"
 BLIND = "action hidden"
-"""The same network, shown that nothing was done."""
+"""The same network with actions hidden."""
 
 
 @dataclass(frozen=True)
 class Tested:
-    """The results of a test: by world, the score of each predictor; `missing` has the worlds that could not be tested."""
+    """The results of a test: each predictor's score by world; `missing` has the worlds that could not be tested."""
 
     rules: str
     task: str
     split: str
     only: tuple[str, ...]
     worlds: int
-    """Worlds of each test, or transitions that were recorded."""
+    """Number of worlds of each test, or of recorded transitions."""
     steps: int
-    """How many steps are predicted."""
+    """Number of predicted steps."""
     scores: Mapping[str, Mapping[str, Score]]
     missing: Mapping[str, tuple[str, ...]]
     trained: Trained
 
     def mean(self, predictor: str) -> float:
-        """The mean of the worlds' losses, each counted once."""
+        """The mean loss over worlds, unweighted."""
         return sum(scores[predictor].loss for scores in self.scores.values()) / len(self.scores)
 
     def plain(self) -> dict[str, Any]:
@@ -77,7 +77,7 @@ class Tested:
 
 
 def ahead(predict: Network, times: int) -> Network:
-    """A network as one for `times` as many steps: applied to what it predicts, again and again."""
+    """A network for `times` the number of steps, which is applied to its own predictions."""
 
     def predicted(ids: torch.Tensor) -> torch.Tensor:
         for _ in range(times - 1):
@@ -90,13 +90,13 @@ def ahead(predict: Network, times: int) -> Network:
 def evaluate(
     trained: Trained, *, worlds: int | None = None, times: int = 1, machine: Machine = HERE, **tested_on: Any
 ) -> Tested:
-    """Test a network and both baselines on worlds that training never uses.
+    """Test a network and both baselines on unseen worlds.
 
     Networks that learned from a dataset are tested by `evaluate_recording`.
 
     Args:
-        worlds: worlds of a split, or random futures of each of its stands; by default 32 and 4.
-        times: how often the network is applied to what it predicts. The baselines learn as many steps at once.
+        worlds: number of worlds of a split, or of random futures of each of its stands; by default 32 and 4.
+        times: number of times to apply the network. The baselines are fitted on all these steps at once.
         tested_on: see `unseen_worlds`.
 
     Raises:
@@ -129,17 +129,19 @@ def evaluate(
 
 
 def evaluate_recording(trained: Trained, recording: Recording, *, machine: Machine = HERE) -> Tested:
-    """Test a network on recorded transitions: those of the test worlds if it learned from this dataset, otherwise all.
+    """Test a network on recorded transitions: those of the test worlds if it was trained on this dataset, otherwise
+    all.
 
-    Beside both baselines, fitted on the training worlds' transitions of this dataset, the network is tested with its
-    actions hidden, unless it never sees them. At most `TRANSITIONS` transitions, evenly spread, are used.
+    Besides both baselines, which are fitted on the dataset's training worlds, the network is also tested with actions
+    hidden, unless it never sees them. At most `TRANSITIONS` evenly spread transitions are used.
 
     Raises:
-        CompileError: PD623 if the network did not learn from a dataset, or the numbers mean something else in this one.
+        CompileError: PD623 if the network was not trained on a dataset, or the numbers of this one have another
+            meaning.
     """
     known, here = trained.config.recorded, recording.recorded
     if known is None:
-        raise misfit(trained.run.path, "it learned from worlds, without actions")
+        raise misfit(trained.run.path, "it was trained on worlds, without actions")
     check_slots(trained.run.path, trained.palette, recording.rules)
     seen, shown = (
         {name: getattr(meaning, name) for name in ("channels", "steps", "speed")} for meaning in (known, here)
@@ -173,10 +175,10 @@ def _baselines(fit: Iterable[Pairs], rules: Ruleset, slots: int) -> dict[str, Ne
 
 
 def unseen_worlds(trained: Trained, *, machine: Machine = HERE, **tested_on: Any) -> TaskWorlds:
-    """Worlds to test a network on. Those that the rules cannot have are left out, as long as others remain.
+    """Worlds to test a network on. Those that the rules cannot have are excluded, unless none remain.
 
-    `tested_on`: see `unseen_data`. Raises CompileError: as `TaskWorlds`; PD623 if the rules have elements that the
-    network has no slots for, or the network learned from a dataset.
+    `tested_on`: see `unseen_data`. Raises CompileError: as `TaskWorlds`; PD623 if the network lacks slots for elements
+    of the rules, or was trained on a dataset.
     """
     if trained.config.recorded is not None:
         raise misfit(trained.run.path, "it predicts recorded transitions, with actions")
@@ -194,12 +196,11 @@ def unseen_data(
     only: tuple[str, ...] | None = None,
     knobs: Mapping[str, int] | None = None,
 ) -> DataConfig:
-    """Return the worlds to test a network on that was trained on `data`.
+    """Return the worlds on which to test a network that was trained on `data`.
 
     Args:
-        task, rules, only, knobs: those of the training data unless others are given; with another task, its own knobs.
-        split: by default `designed` if the task has it, or else the split of the training data, whose worlds have other
-            seeds here.
+        task, rules, only, knobs: by default those of the training data; with another task, its own knobs.
+        split: by default `designed` if the task has it, or else the split of the training data, with other seeds.
     """
     knobs = (data.knobs if task is None else {}) if knobs is None else knobs
     splits = [split.name for split in load_task(task or data.task, knobs=knobs).splits]
@@ -219,7 +220,7 @@ def unseen_data(
 # Pictures
 
 RIGHT, WRONG = np.array([(235, 235, 235), (200, 30, 30)], np.uint8)
-"""Colors of cells that were predicted correctly, and of others."""
+"""Colors of correctly and wrongly predicted cells."""
 TITLE = 14
 """Pixels of the line above a picture."""
 
@@ -241,9 +242,9 @@ class Strip:
 
 @torch.no_grad()
 def strips(predict: Network, worlds: TaskWorlds, *, step: int, times: int = 1, after: int = 0) -> list[Strip]:
-    """A strip for each variant of a split, of worlds that have run `after` steps before.
+    """A strip for each variant of a split, of worlds after `after` steps.
 
-    The network was trained to predict `step` steps, and is applied to what it predicted `times` times.
+    The network was trained to predict `step` steps, and is applied `times` times.
     """
     seeds = unseen_seeds(1, len(worlds.names)).to(worlds.device)
     world = worlds.later(worlds.start(seeds), after)
@@ -265,9 +266,9 @@ def recorded_strips(predict: Network, recording: Recording, count: int = 8) -> l
 
 
 def sheet(strips: list[Strip], rules: Ruleset, *, factor: int = 2) -> NDArray[np.uint8]:
-    """Strips one below the other, uint8 [H', W', 3]: start, truth, prediction, errors. A cell has `factor`² pixels.
+    """Strips below one another, uint8 [H', W', 3]: start, truth, prediction, errors. A cell has `factor`² pixels.
 
-    Each picture has a title. Colors do not follow fields here: networks predict elements alone.
+    Each picture has a title. Colors do not follow fields, since networks only predict elements.
     """
     colors, font = palette(rules.elements), ImageFont.load_default()
     pictures = []

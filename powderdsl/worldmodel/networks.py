@@ -1,7 +1,7 @@
-"""Networks: the paper's U-net (Frans & Isola 2023, section 4), and users' own, named ``module:Class``.
+"""Networks: the paper's U-net (Frans & Isola 2023, section 4), and custom networks named ``module:Class``.
 
-Importing a module executes its code. So a name is imported only where the user gives it, on the command line or in
-Python. Runs record it as text, which nothing imports.
+Importing a module executes its code. So a name is imported only if the user passes it on the command line or in Python.
+Runs record it as text, which is never imported.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from powderdsl.system.writing import failure
 from powderdsl.worldmodel.config import TrainConfig
 
 SIDES = 4
-"""Rows and columns are padded to a multiple of this: two poolings halve them twice."""
+"""Rows and columns are padded to a multiple of this, since two poolings halve them twice."""
 
 NO_ELEMENT = 255
 """In inputs with actions: nothing is placed on this cell."""
@@ -39,12 +39,12 @@ CONTRACT = "it is called as NAME(channels, slots) and gives a torch.nn.Module: f
 
 @dataclass(frozen=True)
 class ActionChannels:
-    """Inputs, uint8 -> what networks see, float32 [B, channels, H, W]: the elements, one-hot, and what belongs to actions.
+    """From inputs, uint8, to channels, float32 [B, channels, H, W]: one-hot elements, and actions.
 
-    Without `observed`, inputs are ids [B, H, W]. Otherwise they are a state and an action, [B, observed + 3, H, W] as
-    `recordings` has them. Then the elements are those after the action has placed its own, and more channels follow: the
-    others of the observation, about −1 to 1; and, with `actions`, 1 where the action places an element, 1 where it
-    blows, and its speed there in rows and columns, −1 to 1. Without, nothing of the action is seen.
+    Without `observed`, inputs are ids [B, H, W]. Otherwise, they are a state and an action, [B, observed + 3, H, W] as
+    in `recordings`. Then the elements are those after the action has placed its own, followed by the other channels of
+    the observation, about −1 to 1, and, with `actions`, by 1 where the action places an element, 1 where it blows, and
+    its speed there in rows and columns, −1 to 1. Without `actions`, the action is hidden.
     """
 
     slots: int
@@ -70,14 +70,14 @@ class ActionChannels:
 
 
 def without_actions(inputs: Tensor) -> Tensor:
-    """Inputs in which nothing was done: uint8 [B, C + 3, H, W]."""
+    """Inputs without an action: uint8 [B, C + 3, H, W]."""
     blanked = inputs.clone()
     blanked[:, -3], blanked[:, -2:] = NO_ELEMENT, 0
     return blanked
 
 
 class Encoded(nn.Module):
-    """A network on channels, as one on ids: encodes its inputs first."""
+    """A network on ids that encodes its inputs for a network on channels."""
 
     def __init__(self, encoder: ActionChannels, network: nn.Module):
         super().__init__()
@@ -91,7 +91,7 @@ class Encoded(nn.Module):
 
 
 class UNet(nn.Module):
-    """Element ids, uint8 [B, H, W] -> logits of what each cell will hold, float32 [B, slots, H, W].
+    """Element ids, uint8 [B, H, W] -> logits of each cell's future element, float32 [B, slots, H, W].
 
     With `channels`, the input is float32 [B, channels, H, W] instead.
 
@@ -116,7 +116,7 @@ class UNet(nn.Module):
         height, width = inputs.shape[-2:]
         cells = inputs
         if inputs.ndim == 3:
-            # One-hot as [B, H, W, C] seen as [B, C, H, W] has channels last in memory, and convolutions keep that.
+            # One-hot [B, H, W, C] viewed as [B, C, H, W] has channels last in memory, which convolutions preserve.
             cells = F.one_hot(inputs.long(), self.slots).to(self.head.weight.dtype).permute(0, 3, 1, 2)
         cells = F.pad(cells, (0, -width % SIDES, 0, -height % SIDES))
         cells = cells.contiguous(memory_format=torch.channels_last)
@@ -139,10 +139,10 @@ def _block(before: int, after: int) -> nn.Sequential:
 
 
 def fresh_unet(slots: int, width: int, seed: int, channels: int | None = None) -> UNet:
-    """A network with random weights that depend on the seed alone: made on the CPU, the same for every device.
+    """A network with random weights that depend only on the seed; created on the CPU, so the same for every device.
 
-    Their spread is that of He et al. (2015): activations keep their size from layer to layer. With torch's own, which
-    shrink them, the loss takes about three times as many iterations to fall as far.
+    Initialized as in He et al. (2015), which keeps the scale of activations. With torch's default, which shrinks them,
+    the loss takes about three times as many iterations to fall as far.
     """
     network = UNet(slots, width, channels)
     source = torch.Generator().manual_seed(seed)
@@ -164,28 +164,28 @@ def fresh_unet(slots: int, width: int, seed: int, channels: int | None = None) -
 
 @dataclass(frozen=True)
 class CustomNetwork:
-    """A user's network: its name, and what makes it, a class or another callable. Made by `custom_network`.
+    """A custom network: its name, and the class or other callable that creates it. Created by `custom_network`.
 
-    ``make(channels, slots)`` gives a module from float32 [B, channels, H, W] to logits [B, slots, H, W].
+    ``make(channels, slots)`` returns a module from float32 [B, channels, H, W] to logits [B, slots, H, W].
     """
 
     name: str
     make: Callable[[int, int], Any]
 
     def build(self, encoder: ActionChannels, seed: int) -> Encoded:
-        """A network whose random weights depend on the seed alone.
+        """A network whose random weights depend only on the seed.
 
-        Raises CompileError (PD625) if it is not a module, or making it fails.
+        Raises CompileError (PD625) if it is not a module or cannot be created.
         """
-        with torch.random.fork_rng(devices=[]), _reporting_user_errors(self.name, "cannot be made"):
+        with torch.random.fork_rng(devices=[]), _reporting_user_errors(self.name, "cannot be created"):
             torch.manual_seed(seed)
             network = self.make(encoder.channels, encoder.slots)
             if not isinstance(network, nn.Module):
-                raise TypeError(f"it must give a torch.nn.Module, found {type(network).__name__}")
+                raise TypeError(f"it must return a torch.nn.Module, found {type(network).__name__}")
         return Encoded(encoder, network)
 
     def check(self, encoder: ActionChannels, size: tuple[int, int], seed: int) -> None:
-        """Try a network on two worlds of a size: the shape of its logits, and whether it can learn.
+        """Check, on two worlds of a size, the shape of a network's logits, and that it can be trained.
 
         Raises CompileError (PD625).
         """
@@ -200,12 +200,12 @@ class CustomNetwork:
                 shape = f"{list(logits.shape)} of {logits.dtype}"
             if not (shape.startswith(str(expected)) and logits.is_floating_point()):
                 channels = [2, encoder.channels, *size]
-                raise ValueError(f"it must give logits {expected}, found {shape}, for channels {channels}")
+                raise ValueError(f"it must return logits {expected}, found {shape}, for channels {channels}")
             weights = [weight for weight in network.parameters() if weight.requires_grad]
             if logits.requires_grad and weights:
                 F.cross_entropy(logits.float(), torch.zeros(2, *size, dtype=torch.int64)).backward()
             if all(weight.grad is None for weight in weights):
-                why = "no gradient reaches a parameter: logits must depend on some that require one"
+                why = "no parameter gets a gradient: logits must depend on some that require one"
                 raise ValueError(why)
 
 
@@ -213,16 +213,16 @@ def custom_network(name: str) -> CustomNetwork:
     """Import a network by its name, ``module:Class``, from installed packages or the current folder.
 
     Raises:
-        CompileError: PD625 if the name has another form, or there is no such module or class in it.
+        CompileError: PD625 if the name has another form, or the module or class does not exist.
     """
     if os.getcwd() not in sys.path:
-        sys.path.append(os.getcwd())  # behind all others: nothing that is installed is replaced
+        sys.path.append(os.getcwd())  # last, so that it does not shadow installed modules
     with _reporting_user_errors(name, "cannot be imported"):
         if name.count(":") != 1 or not all(map(str.isidentifier, name.replace(":", ".").split("."))):
             raise ValueError("write MODULE:CLASS, such as nets:Deep")
         make = pkgutil.resolve_name(name)
         if not callable(make):
-            raise TypeError(f"it is not a class but {type(make).__name__}")
+            raise TypeError(f"expected a class, found {type(make).__name__}")
     return CustomNetwork(name, make)
 
 
@@ -254,7 +254,7 @@ def encoder_of(config: TrainConfig, slots: int) -> ActionChannels:
 
 
 def network_of(config: TrainConfig, slots: int, own: nn.Module | CustomNetwork | None) -> nn.Module:
-    """The network that is given, or the paper's, which encodes worlds without actions by itself."""
+    """The given network, or the paper's, which encodes worlds without actions itself."""
     encoder = encoder_of(config, slots)
     if isinstance(own, CustomNetwork):
         return own.build(encoder, config.seed)
@@ -266,18 +266,18 @@ def network_of(config: TrainConfig, slots: int, own: nn.Module | CustomNetwork |
 
 
 def fit_weights(model: nn.Module, checkpoint: Checkpoint, *, grow: bool = False) -> None:
-    """Give a network the weights of a checkpoint, which may hold anything.
+    """Load the weights of a checkpoint, which may contain anything, into a network.
 
-    `grow`: the network may be larger: what the checkpoint lacks keeps the weights that it has. Raises CompileError
-    (PD623) if they are those of another network.
+    `grow`: the network may be larger, and weights missing in the checkpoint are unchanged. Raises CompileError (PD623)
+    for weights of another network.
     """
-    with reporting_misfits(checkpoint.path, "its weights are those of another network"):
+    with reporting_misfits(checkpoint.path, "its weights belong to another network"):
         weights = dict(checkpoint.state["model"])
         model.load_state_dict(_grown(weights, model) if grow else weights)
 
 
 def _grown(state: dict[str, Any], model: nn.Module) -> dict[str, Any]:
-    """Weights in the shapes of a network that has more slots, first in each dimension."""
+    """Weights at the start of each dimension of a network with more slots."""
     for name, fresh in model.state_dict().items():
         old = state.get(name)
         if not isinstance(old, Tensor) or old.ndim != fresh.ndim or old.shape == fresh.shape:

@@ -1,6 +1,6 @@
-"""Scores of predictions: networks and baselines by the same measure.
+"""Scores of predictions, for networks and baselines alike.
 
-All but the loss follow from counts of cells, so they are the same whatever the order and the batches of the pairs.
+All except the loss follow from counts of cells, so they do not depend on the order and batches of pairs.
 """
 
 from __future__ import annotations
@@ -20,26 +20,26 @@ Network = Callable[[Tensor], Tensor]
 """Ids uint8 [B, H, W] -> logits [B, slots, H, W]."""
 
 TOGETHER = 1 << 17
-"""The most cells that a network is given at once."""
+"""Maximum number of cells in a batch."""
 
 BINS = 15
 """Bins of equal width of probabilities, as in Guo et al. (2017)."""
 
 UNITS = 1 << 24
-"""A probability is counted as an integer number of this share, so that sums do not depend on their order."""
+"""Probabilities are counted in integer units of this share, so that sums do not depend on their order."""
 
 KINDS = ("all", "changed", "change")
-"""Calibration tables: the predicted element, of all cells and of those that change; and whether a cell changes."""
+"""Calibration tables: of the predicted element, for all cells and for those that change; and of changes."""
 
 
 @dataclass(frozen=True)
 class Score:
     """Counts of cells, and the sum of their losses.
 
-    `confusion`, int64 [slots, slots], counts cells by what they became and what was predicted. A cell is *changed* if it
-    holds another element at the end than at the start, and *predicted to change* if the most likely element is another
-    than at the start. `bins`, int64 [3, BINS, 3], has a table for each of `KINDS`: for each bin of probabilities the
-    number of cells, how many of them the prediction was right about, and the sum of their probabilities in `UNITS`.
+    `confusion`, int64 [slots, slots], counts cells by what they became and what was predicted. A cell is *changed* if
+    its element at the end differs from that at the start, and *predicted to change* if the most likely element differs
+    from that at the start. `bins`, int64 [3, BINS, 3], has a table for each of `KINDS`: for each bin of probabilities
+    the number of cells, how many of them the prediction was right about, and the sum of their probabilities in `UNITS`.
     """
 
     loss_sum: float
@@ -59,7 +59,7 @@ class Score:
 
     @property
     def loss(self) -> float:
-        """Cross-entropy a cell, in nats."""
+        """Cross-entropy per cell, in nats."""
         return self.loss_sum / max(self.cells, 1)
 
     @property
@@ -68,17 +68,17 @@ class Score:
 
     @property
     def changed_accuracy(self) -> float | None:
-        """Of the changed cells, the share whose new element is predicted: the recall of changes. None without any."""
+        """The recall of changes: the share of changed cells whose new element is predicted. None without any."""
         return _share(self.changed_right, self.changed)
 
     @property
     def change_precision(self) -> float | None:
-        """Of the cells predicted to change, the share whose new element is predicted. None without any."""
+        """The precision of changes: of cells predicted to change, the share predicted right. None without any."""
         return _share(self.changed_right, self.predicted_changed)
 
     @property
     def change_f1(self) -> float | None:
-        """The harmonic mean of precision and recall of changes. None if nothing changes nor is predicted to."""
+        """The harmonic mean of precision and recall of changes. None without any actual or predicted changes."""
         return _share(2 * self.changed_right, self.changed + self.predicted_changed)
 
     @property
@@ -88,7 +88,7 @@ class Score:
 
     @property
     def changed_ece(self) -> float | None:
-        """The same over the changed cells alone."""
+        """The same over the changed cells only."""
         return self._calibration_error("changed")
 
     @property
@@ -139,7 +139,7 @@ MEASURES = (
 
 
 def ids_of(inputs: Tensor) -> Tensor:
-    """The ids, uint8 [B, H, W], of inputs: the first channel where these also have an action."""
+    """The ids, uint8 [B, H, W], of inputs: the first channel of inputs with an action."""
     return inputs if inputs.ndim == 3 else inputs[:, 0]
 
 
@@ -185,7 +185,7 @@ def _binned(chances: Tensor, right: Tensor) -> Tensor:
 
 
 def baseline(chances: Tensor) -> Network:
-    """Log-probabilities of what a cell becomes, by what it holds.
+    """Log-probabilities of a cell's next element, by its current one.
 
     `chances` is float64 [slots, slots]: a row for each start element, which sums to 1.
     """
@@ -208,10 +208,10 @@ def _counts(rows: Tensor, columns: Tensor, slots: int) -> Tensor:
 
 
 def still(counts: Tensor, ids: Sequence[int]) -> Network:
-    """ "Nothing changes": a cell stays with one chance, and becomes each of the other elements with an equal share.
+    """ "Nothing changes": a cell stays the same with one probability, and all other elements are equally likely.
 
-    The chance is the one with the lowest cross-entropy on the counted pairs: the share of cells that stayed, with one
-    cell that stayed and one that did not counted besides. `ids` are those of the elements that there are.
+    The probability has the lowest cross-entropy on the counted pairs: the share of cells that stayed, after adding one
+    cell that stayed and one that did not. `ids` are those of existing elements.
     """
     stays = (int(counts.diagonal().sum()) + 1) / (int(counts.sum()) + 2)
     chances = torch.zeros(len(counts), len(counts), dtype=torch.float64)
@@ -220,9 +220,9 @@ def still(counts: Tensor, ids: Sequence[int]) -> Network:
 
 
 def frequent(counts: Tensor, ids: Sequence[int]) -> Network:
-    """ "Most frequent outcome": for each start element the counted shares of what it became.
+    """ "Most frequent outcome": for each start element, the shares of its outcomes.
 
-    One cell is counted besides for each element that it may become, those of `ids`, so that no chance of these is 0.
+    One cell is added for each possible outcome in `ids`, so that none of them has probability 0.
     """
     seen = counts.double()
     seen[:, list(ids)] += 1
@@ -230,8 +230,8 @@ def frequent(counts: Tensor, ids: Sequence[int]) -> Network:
 
 
 def elements_of(total: Score, palette: tuple[str | None, ...]) -> dict[str, dict[str, float | int | None]]:
-    """By element: cells that ended as it, the share of these that was predicted (recall), and the share of cells
-    predicted as it that were (precision). None where there are no such cells."""
+    """By element: the number of cells that became it, the share of these that was predicted (recall), and the share of
+    correct predictions of it (precision). None without such cells."""
     confusion = total.confusion
     counts = zip(
         confusion.sum(1).tolist(), confusion.sum(0).tolist(), confusion.diagonal().tolist(), strict=True

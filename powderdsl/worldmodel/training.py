@@ -1,4 +1,4 @@
-"""Training: a buffer of pairs, Adam, and a run folder that any kill leaves in order; and networks of runs."""
+"""Training with a buffer of pairs and Adam, in a run folder that survives kills; and networks of runs."""
 
 from __future__ import annotations
 
@@ -51,22 +51,22 @@ if TYPE_CHECKING:
     from powderdsl.worldmodel.worlds import Recording
 
 TOGETHER = 1 << 20
-"""The most cells that are simulated together when the buffer is filled."""
+"""Maximum number of cells simulated together to fill the buffer."""
 
 _BATCH, _FIRST = 0x57A7, 0x0FF5
 """The numbers of the hashes that choose batches and the first world."""
 
 
 class Replay:
-    """A buffer of pairs: `starts` and `ends`, uint8 [size, H, W], as the iteration `iteration` needs them.
+    """A buffer of pairs: `starts` and `ends`, uint8 [size, H, W], for the iteration `iteration`.
 
-    What it holds, and which pairs a batch has, are functions of the configuration, the seed and the iteration. So a
-    checkpoint needs no copy of it: `advance_to` makes it again, cell by cell the same.
+    Its contents, and the pairs of a batch, are functions of the configuration, the seed and the iteration. So a
+    checkpoint does not need to store it: `advance_to` recreates it exactly.
 
     Args:
-        seed: the run's. It decides which world comes first, and which pairs a batch has.
-        store: ``memory`` (of `device`), ``disk``, or ``auto``: disk where the buffer would take more than half of memory.
-        folder: where its files lie, unless it is that of temporary files.
+        seed: the run's seed, which determines the first world and the pairs of each batch.
+        store: ``memory`` (of `device`), ``disk``, or ``auto``: disk if the buffer would take more than half of memory.
+        folder: the folder of its files; by default, that of temporary files.
     """
 
     def __init__(
@@ -92,16 +92,16 @@ class Replay:
         if store == "memory":
             self.starts, self.ends = torch.zeros(2, *shape, dtype=torch.uint8, device=self.device)
         else:
-            with TemporaryFile(dir=folder) as file:  # what is mapped outlives the file
+            with TemporaryFile(dir=folder) as file:  # mapped memory outlives the file
                 pairs = np.memmap(file, dtype=np.uint8, mode="w+", shape=(2, *shape))
             self.starts, self.ends = torch.from_numpy(pairs)
         self.iteration = -1
         self._live: Any = None
 
     def advance_to(self, iteration: int) -> None:
-        """Make the buffer's contents before an iteration, counted from 0."""
+        """Create the buffer's contents before an iteration, counted from 0."""
         config = self.config
-        back = -(-self.size // config.refresh)  # what older iterations brought has been overwritten
+        back = -(-self.size // config.refresh)  # pairs of older iterations have been overwritten
         begin = max(0, iteration - back) // config.pairs * config.pairs
         if self.all_fit or begin == 0:
             self._fill()
@@ -110,7 +110,7 @@ class Replay:
             self.advance()
 
     def advance(self) -> None:
-        """Go to the next iteration: `refresh` worlds continue by some steps, and their pairs replace the oldest."""
+        """Advance to the next iteration: `refresh` worlds run some steps, and their pairs replace the oldest."""
         if not self.all_fit:
             config, many = self.config, self.config.refresh
             turn, moment = divmod(self.iteration, config.pairs)
@@ -168,10 +168,10 @@ def memory_of(device: torch.device) -> int:
 KIND = "worldmodel"
 
 LOG_EVERY = 10
-"""Iterations whose mean loss makes a line of the metrics."""
+"""Number of iterations whose mean loss makes a line of the metrics."""
 
 VALIDATED = 256
-"""The most recorded transitions that a network is validated on."""
+"""Maximum number of recorded transitions to validate a network on."""
 
 MEASURED = ("accuracy", "changed_accuracy", "change_f1", "ece", "change_ece")
 """Measures of a validation besides the loss."""
@@ -181,7 +181,7 @@ Tell = Callable[["TrainingProgress"], None]
 
 @dataclass(frozen=True)
 class TrainingProgress:
-    """The state after each iteration: how many are done, and the last loss that was logged."""
+    """The state after each iteration: the number of iterations, and the last logged loss."""
 
     done: int
     of: int
@@ -204,26 +204,26 @@ def train(
     save_seconds: float = 60,
     validate_every: int = 0,
 ) -> RunFolder:
-    """Train a network until `config.iterations`, or continue with the run that is in the folder.
+    """Train a network until `config.iterations`, or resume the run in the folder.
 
-    On one device and one thread the weights are the same however often a run is killed and continues.
+    On one device and one thread, killing and resuming a run does not change its weights.
 
     Args:
-        worlds: your own, instead of those of the task that `config.data` names, whose rules and split then say nothing.
+        worlds: your own worlds, instead of those of `config.data`, whose rules and split are then ignored.
         recording: transitions with actions, instead of worlds: see `recordings.open_recording`.
-        network: your own, with ids uint8 [B, H, W] -> logits [B, slots, H, W], or a `CustomNetwork`, whose name the run
-            records; the paper's U-net otherwise.
-        parent: weights to start from, of the run that `finetuned` was given.
-        note: more for ``run.json``, such as where the parent lies.
-        save_seconds: how often a checkpoint is written, besides the last one.
-        validate_every: after how many iterations, and at the end, to score the network on held-out worlds
-            (`validation_pairs`); 0: never. It decides nothing about the weights, so it may change when a run continues.
+        network: your own network, ids uint8 [B, H, W] -> logits [B, slots, H, W], or a `CustomNetwork`, whose name the
+            run records. The default is the paper's U-net.
+        parent: initial weights, of the run passed to `finetuned`.
+        note: further entries of ``run.json``, such as the parent's path.
+        save_seconds: seconds between checkpoints; the last state is always saved.
+        validate_every: number of iterations between scores on held-out worlds (`validation_pairs`), also computed at
+            the end; 0: never. It does not affect the weights, so it may change when a run is resumed.
 
     Raises:
         CompileError: from `TaskWorlds` and `open_run`; PD622 if another process trains there; PD623 if weights do not
-            fit the network, or the network that the run was begun with is not given; PD624 if the loss is no longer
-            finite; PD625 for a `CustomNetwork` that cannot be trained.
-        ValueError: your own network gives logits of another shape.
+            fit the network, or the run's custom network is not passed; PD624 if the loss is no longer finite; PD625 for
+            a `CustomNetwork` that cannot be trained.
+        ValueError: your own network returns logits of another shape.
         KeyboardInterrupt: Ctrl-C, after a last checkpoint.
     """
     path = Path(folder)
@@ -236,7 +236,7 @@ def train(
         config = recording.configured(config)
         note["dataset"] = str(recording.dataset.folder)
     elif config.recorded is not None:
-        raise misfit(path, "it learns from a dataset, which is not given")
+        raise misfit(path, "it needs its dataset")
     palette = _palette_for(config, path, worlds)
     identity: dict[str, Any] = {}
     if recording is None and worlds is None:
@@ -274,12 +274,12 @@ def train(
 
 
 def _random_numbers_kept(device: torch.device) -> AbstractContextManager[None]:
-    """Restore torch's global generators at the end."""
+    """Restore torch's global generators afterwards."""
     return torch.random.fork_rng([device] if device.type == "cuda" else [])
 
 
 class _Trainer:
-    """A network in training: `done` iterations so far, and the losses since the last line of metrics."""
+    """A network in training: the iterations done, and the losses since the last line of metrics."""
 
     def __init__(self, config: TrainConfig, machine: Machine, run: RunFolder, model: nn.Module, slots: int):
         self.config, self.machine, self.run, self.model, self.slots = config, machine, run, model, slots
@@ -289,28 +289,28 @@ class _Trainer:
         self.batch: Callable[[int, int], Pairs]
         """The pairs of an iteration's batch, by the iteration and their number."""
         self.advance: Callable[[], None] = lambda: None
-        """Make the worlds of the next iteration."""
+        """Create the worlds of the next iteration."""
         self.validate_every, self.held_out = 0, list[Pairs]()
 
     def restore(self, parent: Checkpoint | None) -> None:
-        """Continue from the run's newest checkpoint; a new run starts with the weights of `parent`."""
+        """Resume from the run's newest checkpoint; a new run starts with the weights of `parent`."""
         checkpoint = self.run.latest_checkpoint()
         if checkpoint is None:
             if parent is not None:
                 fit_weights(self.model, parent, grow=True)
             return
         fit_weights(self.model, checkpoint)
-        with reporting_misfits(checkpoint.path, "its state is that of another run"):
+        with reporting_misfits(checkpoint.path, "its state belongs to another run"):
             self.optimizer.load_state_dict(checkpoint.state["optimizer"])
             self.done, self.recent = checkpoint.step, [float(loss) for loss in checkpoint.state["recent"]]
 
     def train(self, tell: Tell, save_seconds: float) -> None:
-        """Train to the end. A signal is raised once a checkpoint is written, a second one at once."""
+        """Train to the end. A signal is raised after a checkpoint is written, a second one immediately."""
         config, total = self.config, self.config.iterations
         loss, held_out, making = None, None, 0.0
         saved = since = time.monotonic()
         self.model.train()
-        # An iteration is never left half done.
+        # Iterations are never interrupted.
         with Metrics(self.run.path, self.done) as metrics, delay_signal() as interrupted:
             while self.done < total and not interrupted():
                 self.recent.append(self.step(*self.batch(self.done, config.batch)))
@@ -348,9 +348,9 @@ class _Trainer:
             self.save()
 
     def step(self, starts: Tensor, ends: Tensor) -> float:
-        """One step of Adam; the loss before it: cross-entropy a cell, in nats.
+        """Take one step of Adam, and return the loss before it: cross-entropy per cell, in nats.
 
-        Networks that draw random numbers, as for dropout, draw the same ones after any interruption.
+        Networks with random numbers, such as for dropout, draw the same ones after an interruption.
         """
         torch.manual_seed(int(mix(base_keys(torch.tensor([self.config.seed]), torch.tensor([self.done]))[0])))
         cuda = torch.device(self.machine.device).type == "cuda"
@@ -358,7 +358,7 @@ class _Trainer:
             logits = self.model(starts)
         expected = (len(starts), self.slots, *starts.shape[-2:])
         if logits.shape != expected:
-            raise ValueError(f"the network must give logits {list(expected)}, found {list(logits.shape)}")
+            raise ValueError(f"the network must return logits {list(expected)}, found {list(logits.shape)}")
         loss = F.cross_entropy(logits.float(), ends.long())
         self.optimizer.zero_grad(set_to_none=True)
         loss.backward()
@@ -381,14 +381,14 @@ class _Trainer:
 
 
 def network_missing(folder: Path, name: str) -> CompileError:
-    """The error for a run whose network has to be given, for the run's files must not decide what is executed (PD623)."""
-    why = f"it was trained with a network of its own, which it calls `{name}`"
-    helps = ("if you trust that code, give `--network` as in training; it is not imported otherwise",)
+    """The error for a run whose network must be passed, since files must not determine what is executed (PD623)."""
+    why = f"it was trained with the custom network `{name}`"
+    helps = ("if you trust that code, pass `--network` as in training; otherwise it is not imported",)
     return misfit(folder, why, helps=helps)
 
 
 def load_rules_of(config: DataConfig, palette: Palette) -> Ruleset:
-    """The rules that a configuration speaks of, with the ids of a palette. Raises CompileError."""
+    """The rules of a configuration, with the ids of a palette. Raises CompileError."""
     if config.rules:
         return load(config.rules, params=config.params, palette=palette)
     return load_task(config.task, knobs=config.knobs, params=config.params, palette=palette).ruleset
@@ -397,8 +397,8 @@ def load_rules_of(config: DataConfig, palette: Palette) -> Ruleset:
 def palette_of(config: DataConfig, slots: int = 0) -> tuple[str | None, ...]:
     """The qualified name of the element of each slot: those of the task's own rules, and of the rules.
 
-    Packs that are left out have slots too, so those that come later need no others. `slots` is how many there are at
-    least. Raises CompileError.
+    Packs that are left out have slots too, which they use when added later. `slots` is the minimum number. Raises
+    CompileError.
     """
     names = list(whole_palette(*load_task(config.task, knobs=config.knobs).rules))
     if config.rules:
@@ -407,7 +407,7 @@ def palette_of(config: DataConfig, slots: int = 0) -> tuple[str | None, ...]:
 
 
 def _palette_for(config: TrainConfig, folder: Path, worlds: Worlds | None) -> tuple[str | None, ...]:
-    """The slots of a run: as asked for, as recorded in its folder, or those that its rules need."""
+    """The slots of a run: as requested, as recorded in its folder, or as its rules need."""
     if config.palette:
         return config.palette
     if worlds is not None:
@@ -418,16 +418,16 @@ def _palette_for(config: TrainConfig, folder: Path, worlds: Worlds | None) -> tu
         return palette
     recorded = recorded_palette(read_run(folder))
     fits = len(recorded) >= config.slots and {*palette} <= {*recorded, None}
-    return recorded if fits else palette  # `open_run` refuses another run
+    return recorded if fits else palette  # `open_run` rejects another run
 
 
 def check_slots(folder: Path, palette: Palette, rules: Ruleset) -> None:
-    """Raises CompileError (PD623) if a run's network has no slots for elements of some rules."""
-    fix = "or teach the network those packs: `powderdsl wm finetune RUN --packs PACK`"
+    """Raise CompileError (PD623) if a run's network has no slots for elements of some rules."""
+    fix = "or train the network on those packs: `powderdsl wm finetune RUN --packs PACK`"
     check_palette(folder, palette, {element.id: element.qualified for element in rules.elements}, fix)
 
 
-# Networks that have been trained: read from their runs, and taught packs that they have not seen
+# Trained networks: reading them from runs, and fine-tuning them on new packs
 
 
 @dataclass(frozen=True)
@@ -447,11 +447,11 @@ def load_trained(
     """The network of a run, with its newest weights, ready to predict.
 
     Args:
-        network: that of the training, unless it was the U-net. A run only records its name.
+        network: the network of the training, unless it was the U-net. A run only records its name.
 
     Raises:
-        CompileError: PD620 if there is no run, or no checkpoint that can be read; PD623 if the weights do not fit, or the
-            network is not given, or another one; PD625 if it cannot be made.
+        CompileError: PD620 if there is no run, or no checkpoint that can be read; PD623 if the weights do not fit, or
+            the network is missing or another one; PD625 if it cannot be created.
     """
     run = find_run(path, KIND)
     try:
@@ -469,31 +469,31 @@ def load_trained(
     return Trained(run, config, palette, model.to(device).eval(), checkpoint)
 
 
-# Transfer: packs that a network has not seen are added to its rules, and it continues from its weights
+# Transfer: new packs are added to a network's rules, and training continues from its weights
 
 SIMPLER = "kinds"
-"""The knob that says how many elements are drawn: other packs' elements come after all of these."""
+"""The knob for the number of elements to draw, among which other packs' elements come last."""
 
 
 def finetuned(
     trained: Trained, packs: Sequence[str], *, iterations: int = 100, **changes: Any
 ) -> TrainConfig:
-    """The configuration that continues from a network, on worlds in which elements of `packs` alone are drawn.
+    """The configuration to continue training a network on worlds that draw only elements of `packs`.
 
-    The rules are those of the run with the packs added. Elements that the network knows keep their slots; others get
-    its free slots, and where none are left the network grows. A knob for the number of elements is left at its default,
-    for its list may end before the packs' elements. Rulesets are not varied.
+    The rules are those of the run with the packs added. Elements with slots keep them; others get free slots, and if
+    none are left, the network grows. A knob for the number of elements has its default, since its list may end before
+    the packs' elements. Rulesets are not varied.
 
     Args:
         packs: names of shipped packs or of packs that the run left out, or files.
         changes: other fields of `TrainConfig`.
 
     Raises:
-        CompileError: what `load` raises.
+        CompileError: the errors of `load`.
     """
     config = trained.config
     if config.recorded is not None:
-        raise misfit(trained.run.path, "it learned from a dataset, and other packs are not in it")
+        raise misfit(trained.run.path, "it was trained on a dataset, which lacks other packs")
     own = config.data.rules or "+".join(load_task(config.data.task).rules)
     data = with_packs(config.data, own, packs)
     rules = load_rules_of(data, trained.palette)
@@ -507,7 +507,7 @@ def finetuned(
 
 
 def with_packs(data: DataConfig, own: str, packs: Sequence[str]) -> DataConfig:
-    """The worlds of `data` under its own rules with packs added, which alone are drawn. Raises CompileError as `load`."""
+    """The worlds of `data` under its own rules plus packs, drawing only these. Raises CompileError as `load`."""
     knobs = {name: value for name, value in data.knobs.items() if name != SIMPLER}
     return replace(data, rules=add(own, packs), only=pack_names(own, packs), knobs=knobs, rulesets=0)
 
@@ -518,7 +518,7 @@ def with_packs(data: DataConfig, own: str, packs: Sequence[str]) -> DataConfig:
 def pack_names(rules: str, words: Iterable[str]) -> tuple[str, ...]:
     """The names of packs that are given by name or as files. Raises CompileError for a file that is not a pack.
 
-    A name of a pack of the rules, left out or not, stands for that pack.
+    A name that a pack of the rules has, left out or not, means that pack.
     """
     known = _packs_named(rules)
     packs: dict[str, None] = {}
@@ -528,13 +528,13 @@ def pack_names(rules: str, words: Iterable[str]) -> tuple[str, ...]:
 
 
 def leave_out(rules: str, packs: Iterable[str]) -> str:
-    """The rules without some packs, which are given by name or as files."""
+    """The rules without some packs, given by name or as files."""
     plus, minus = split_names(rules)
     return _written(plus, [*minus, *pack_names(rules, packs)])
 
 
 def add(rules: str, packs: Iterable[str]) -> str:
-    """The rules with some packs, by name or as files: those that were left out come back, others are added."""
+    """The rules with some packs, by name or as files: packs that were left out are restored, others are added."""
     plus, minus = split_names(rules)
     known = _packs_named(rules)
     for word in packs:
@@ -546,7 +546,7 @@ def add(rules: str, packs: Iterable[str]) -> str:
 
 
 def keep(rules: str, packs: Sequence[str]) -> str:
-    """The rules with these packs alone. Those that the rules do not have are added."""
+    """The rules with only these packs. Packs that the rules do not have are added."""
     names = pack_names(rules, packs)
     others = [pack for pack in load(rules).packs if pack not in names]
     return add(leave_out(rules, others), packs)
@@ -565,7 +565,7 @@ def _names_of(*words: str) -> tuple[str, ...]:
 
 
 def _written(plus: Sequence[str], minus: Iterable[str]) -> str:
-    """Names joined by ``+``. What is left out stands behind a name, for a file's name may have a ``-`` of its own."""
+    """Names joined by ``+``. Exclusions follow a name, since a file name may itself contain a ``-``."""
     names = list(plus)
     plain = [number for number, name in enumerate(names) if not name.endswith((".yaml", ".yml"))]
     place = plain[0] if plain else len(names) - 1

@@ -1,9 +1,9 @@
-"""Worlds to learn from: those of a task without its agent, under other rules, and with fewer elements to draw; and
-transitions recorded from a task, each a state, an action, and the state after it.
+"""Training data: worlds of a task without its agent, possibly under other rules or with fewer elements; and transitions
+recorded from a task, each a state, an action, and the next state.
 
-A recorded input is uint8 [B, C + 3, H, W]: the C channels of the observation, and three of what the action does to each
-cell, as `tasks.tensors.actions.Hands` does it: the element that it places (`NO_ELEMENT` for none), and the rows and columns
-of its speed plus 2 (0 where it does not blow). `ActionChannels` makes of it what networks see.
+A recorded input is uint8 [B, C + 3, H, W]: the C channels of the observation, and three for the action's effect on each
+cell (see `tasks.tensors.actions.Hands`): the element that it places (`NO_ELEMENT` for none), and the rows and columns
+of its speed plus 2 (0 where it does not blow). `ActionChannels` encodes it for networks.
 """
 
 from __future__ import annotations
@@ -39,17 +39,17 @@ if TYPE_CHECKING:
     from powderdsl.datasets import Dataset, Transitions
 
 VALIDATION_SEEDS = 1 << 33
-"""The first seed of worlds that models are validated on during training: far beyond those of tests."""
+"""The first seed of validation worlds, far beyond those of test worlds."""
 
 VALIDATION_WORLDS = 64
-"""The worlds that models are validated on, each at one time."""
+"""Number of validation worlds, each used at one time."""
 
 Pairs = tuple[Tensor, Tensor]
 """Start and end, element ids uint8 [B, H, W] each."""
 
 
 class Worlds(Protocol):
-    """A source of worlds: `TaskWorlds`, or your own. The same seed gives the same world and the same future."""
+    """A source of worlds: `TaskWorlds`, or your own. The same seed gives the same world with the same future."""
 
     rules: Ruleset
     """The rules, with all elements of the worlds."""
@@ -61,12 +61,12 @@ class Worlds(Protocol):
         """The worlds of seeds, int64 [B], such as a `World`: its `ids` are the elements, uint8 [B, H, W]."""
 
     def later(self, world: Any, steps: int) -> Any:
-        """The worlds some steps later; `world` does not change."""
+        """The worlds after some steps; `world` is not changed."""
 
 
 @dataclass(frozen=True)
 class Batch:
-    """Worlds of one seed each, which may run under different rulesets: by ruleset their numbers and their episodes."""
+    """Worlds with one seed each, possibly under different rulesets: their numbers and episodes by ruleset."""
 
     parts: tuple[tuple[Tensor, Episodes], ...]
 
@@ -80,18 +80,18 @@ class Batch:
 
 
 class TaskWorlds:
-    """The worlds of a configuration, ready to run: those of a task's split under some rules.
+    """The executable worlds of a configuration: those of a task's split under some rules.
 
-    Where the split has laws, each world has its own.
+    If the split has laws, each world has its own.
 
     Args:
-        partly: leave out worlds that the rules cannot have; `missing` says which.
-        palette: the ids of a network's slots, as `compiler.load` takes them.
-        machine: backend, device and threads, as `compile_task` takes them.
+        partly: exclude worlds that the rules cannot have, which are listed in `missing`.
+        palette: the ids of a network's slots, as for `compiler.load`.
+        machine: backend, device and threads, as for `compile_task`.
 
     Raises:
-        CompileError: with all that is wrong in the task, the rules, the knobs or the parameters; PD604 where worlds need
-            elements that the rules do not have; PD701 for a backend or device that is not there.
+        CompileError: all mistakes in the task, the rules, the knobs and the parameters; PD604 if worlds need elements
+            that the rules lack; PD701 for an unavailable backend or device.
     """
 
     def __init__(
@@ -109,7 +109,7 @@ class TaskWorlds:
             check_data(config, task, rules)
             task, self.missing = watch(task, config.split, rules, config.only, partly=partly)
         elif config.rules or config.only:
-            raise failure("PD801", f"the split {config.split} of {task.name} has rulesets of its own")
+            raise failure("PD801", f"the split {config.split} of {task.name} has its own rulesets")
         elif machine.get("backend", "auto") == "auto":
             # Compiling many rulesets would take longer than running them.
             machine = {**machine, "backend": starting_backend(str(machine.get("device", "cpu")))}
@@ -118,9 +118,9 @@ class TaskWorlds:
         self.names = tuple(variant.name for variant in split.variants)
         """The names of the variants: seed s gives variant s mod their number."""
         self.fingerprint = fingerprint((split,))
-        """A name for how these worlds start, and for laws they draw: another if the task's file has been changed."""
+        """A digest of the start worlds and the laws that they draw, which changes with the task's file."""
         self.device = torch.device(machine.get("device", "cpu"))
-        """Where worlds are run."""
+        """The device of the worlds."""
         self._program = compile_task(task, split=config.split, rulesets=config.rulesets, **machine)
 
     def start(self, seeds: Tensor) -> Batch:
@@ -157,7 +157,7 @@ def pairs_of(worlds: Worlds, seeds: Tensor, steps: int, pairs: int) -> Iterator[
 
 
 def validation_pairs(worlds: Worlds, config: DataConfig, device: str | torch.device = "cpu") -> list[Pairs]:
-    """Pairs of worlds that neither training nor tests use: one of each world, at times that take turns."""
+    """Pairs of worlds unused by training and tests: one per world, at alternating times."""
     number = torch.arange(VALIDATION_WORLDS, device=device)
     chosen = []
     pairs = pairs_of(worlds, VALIDATION_SEEDS + number, config.steps, config.pairs)
@@ -169,7 +169,7 @@ def validation_pairs(worlds: Worlds, config: DataConfig, device: str | torch.dev
 
 
 def unseen_seeds(count: int, variants: int = 1) -> Tensor:
-    """Seeds that training never uses, int64 [count·variants]: `count` of each variant, all of a variant together."""
+    """Seeds that training never uses, int64 [count·variants]: `count` of each variant, grouped by variant."""
     first = -(-TEST_SEEDS // variants) * variants
     grid = torch.arange(count)[None, :] * variants + torch.arange(variants)[:, None]
     return (first + grid).flatten()
@@ -179,7 +179,7 @@ def unseen_seeds(count: int, variants: int = 1) -> Tensor:
 
 
 class Missing(NamedTuple):
-    """A variant that rules cannot have: the names of elements that they lack, and where the first one is drawn."""
+    """A variant that rules cannot have: the names of missing elements, and the location of the first one."""
 
     name: str
     elements: tuple[str, ...]
@@ -189,14 +189,14 @@ class Missing(NamedTuple):
 def watch(
     task: Task, split: str, rules: Ruleset, only: Collection[str] = (), *, partly: bool = False
 ) -> tuple[Task, tuple[Missing, ...]]:
-    """The worlds of a split under other rules, as a task of that split alone; and those that the rules cannot have.
+    """The worlds of a split under other rules, as a task with only that split; and those that the rules cannot have.
 
-    Elements are found by qualified name. A statement that draws one of several draws among those that the rules have,
-    and also among the elements of packs that the task does not know; of these among the elements of the packs `only`,
-    if any of them has elements. An element that is named alone must be there.
+    Elements are looked up by qualified name. A statement that draws one of several elements uses those that the rules
+    have, plus the elements of packs that the task does not know, limited to the packs `only` if any of these has
+    elements. An element that is named alone must exist.
 
-    `partly`: leave out variants that the rules cannot have, as long as one remains. Raises CompileError (PD604) if
-    worlds need elements that the rules do not have.
+    `partly`: exclude variants that the rules cannot have, unless none remain. Raises CompileError (PD604) if worlds
+    need elements that the rules lack.
     """
     original = task.split(split)
     variants, missing = [], []
@@ -274,7 +274,7 @@ def _missing_elements(
     task: Task, rules: Ruleset, missing: Sequence[Missing], only: Collection[str]
 ) -> CompileError:
     reporter = Reporter()
-    under = f"{rules.name} with {', '.join(sorted(only))} alone" if only else rules.name
+    under = f"{rules.name} with only {', '.join(sorted(only))}" if only else rules.name
     for name, elements, span in missing:
         reporter.error(
             "PD604",
@@ -288,11 +288,11 @@ def _missing_elements(
 
 
 PARTS = (0.8, 0.1, 0.1)
-"""Shares of the worlds for training, validation and tests."""
+"""The shares of worlds for training, validation and tests."""
 
 
 class Recording:
-    """A dataset of a task's transitions, ready to learn from. Made by `open_recording`.
+    """A dataset of a task's transitions to learn from, opened by `open_recording`.
 
     `palette` names the dataset's ids; `rules` are the task's, with these ids. `parts` are the transitions of the
     training, validation and test worlds: the same for every recording of these worlds.
@@ -313,7 +313,7 @@ class Recording:
 
     @cached_property
     def recorded(self) -> Recorded:
-        """The facts about this recording that a run's file keeps."""
+        """The description of this recording in a run's file."""
         agent, recipe = self.task.agent, self.dataset.recipe
         rows = [row.sha256 for row in self.dataset.manifest.shards]
         text = json.dumps([asdict(recipe), rows], sort_keys=True)
@@ -321,7 +321,7 @@ class Recording:
         return Recorded(digest, recipe.channels, agent.steps_per_action, agent.speed)
 
     def configured(self, config: TrainConfig) -> TrainConfig:
-        """A configuration changed to train on this dataset. Whether it uses recorded actions stays."""
+        """A configuration changed to train on this dataset, with or without recorded actions as before."""
         recipe = self.dataset.recipe
         data = DataConfig(
             task=self.name,
@@ -335,7 +335,7 @@ class Recording:
         return replace(config, data=data, palette=slots, recorded=replace(self.recorded, actions=actions))
 
     def eligible(self, rows: Transitions) -> Tensor:
-        """The numbers of transitions of `steps_per_action` steps, int64 [n]: a last action may have free steps."""
+        """The numbers of transitions of `steps_per_action` steps, int64 [n]; a last action may have free steps."""
         length = torch.from_numpy(rows.episodes.length)
         last = torch.zeros(len(rows), dtype=torch.bool)
         if self.task.agent.free_steps:
@@ -349,7 +349,7 @@ class Recording:
         return inputs.to(device), transitions.next_observation[:, 0].to(device)
 
     def painted(self, actions: Tensor) -> Tensor:
-        """Return the channels that show actions, integers [B, 5], cell by cell: uint8 [B, 3, H, W]."""
+        """Return the channels of actions, integers [B, 5], per cell: uint8 [B, 3, H, W]."""
         agent, actions = self.task.agent, actions.long()
         block = cells_of(agent, self.size, actions[:, 1], actions[:, 0])
         choice = torch.tensor(agent.choices)[actions[:, 2]][:, None, None]
@@ -365,7 +365,7 @@ class Recording:
         return [self.pairs(rows, some, device) for some in numbers.split(64)]
 
     def batch(self, iteration: int, count: int, *, seed: int, device: str | torch.device) -> Pairs:
-        """A batch of the training worlds' transitions, all equally likely, which seed and iteration decide."""
+        """A uniformly drawn batch of the training worlds' transitions, determined by seed and iteration."""
         from powderdsl.datasets.dataset import drawn
 
         chosen = torch.from_numpy(drawn(seed % (1 << 62), iteration, count, len(self.training)))
@@ -380,7 +380,7 @@ class Recording:
 def open_recording(folder: str | Path, task: str | None = None) -> Recording:
     """The recording in a dataset's folder.
 
-    `task`: the file of the task that was played, unless it is a shipped one. Raises CompileError: PD630 for a folder
+    `task`: the file of the recorded task, unless it is a shipped one. Raises CompileError: PD630 for a folder
     that is not a dataset, or is damaged; PD631 if it was recorded from another task, or has too few worlds; what
     `load_task` raises.
     """
@@ -389,9 +389,9 @@ def open_recording(folder: str | Path, task: str | None = None) -> Recording:
     dataset = Dataset.open(folder)
     recipe = dataset.recipe
     if task is None and recipe.task not in shipped_tasks():
-        # A name out of the manifest must not lead to a file.
+        # A name in the manifest must not lead to a file.
         message = f"{folder} was recorded from the task `{recipe.task}`, which is not a shipped one"
-        raise failure("PD631", message, helps=("give its file, too",))
+        raise failure("PD631", message, helps=("pass its file, too",))
     name = task or recipe.task
     ids = {int(number): element for number, element in recipe.palette.items()}
     palette = tuple(ids.get(number) for number in range(max(ids) + 1))
@@ -401,7 +401,7 @@ def open_recording(folder: str | Path, task: str | None = None) -> Recording:
     here = {"size": played.size, "actions": played.agent.action_nvec, "choices": choice_names(played)}
     notes = differences(there, here)
     if not notes and recipe.task_fingerprint != fingerprint(played):
-        notes = ("the task, its knobs or its rules have changed since, or it had more packs",)
+        notes = ("the task, its knobs or its rules have changed since, or packs had been added",)
     if notes:
         raise failure("PD631", f"{folder} does not fit the task {played.name}", notes=notes)
     return Recording(dataset, name, played, palette)

@@ -1,4 +1,4 @@
-"""Worlds as ASCII art: one character a cell, by the elements' glyphs or a legend. Whitespace is free."""
+"""Worlds as ASCII art: one character per cell, by the elements' glyphs or a legend. Whitespace is ignored."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from powderdsl.system.writing import failure
 from powderdsl.worlds.raster import MAX_CELLS
 
 MAX_BYTES = 4 * MAX_CELLS
-"""The largest file that is read: the largest world, with whitespace between its cells."""
+"""Maximum size of a file: the largest world, with whitespace between its cells."""
 
 
 def parse_ascii(
@@ -22,7 +22,8 @@ def parse_ascii(
 ) -> NDArray[np.uint8] | None:
     """The ids uint8 [H, W] of a drawing in a text, or None after reporting mistakes.
 
-    Empty lines are skipped. Reports unknown characters (PD610), uneven rows (PD611), no cells or too many (PD607).
+    Empty lines are skipped. Reports unknown characters (PD610), uneven rows (PD611), and empty or too large worlds
+    (PD607).
 
     `legend`: names of elements by character, which override their glyphs. Raises CompileError (PD604) if the legend
     names an unknown element.
@@ -65,7 +66,7 @@ def parse_ascii(
 
 
 def read_ascii(text: str, elements: Sequence[Element], *, name: str = "<drawing>") -> NDArray[np.uint8]:
-    """The ids uint8 [H, W] of a drawing, called `name` in messages. Raises CompileError: what `parse_ascii` reports."""
+    """The ids uint8 [H, W] of a drawing, called `name` in messages. Raises CompileError as `parse_ascii` reports."""
     reporter = Reporter()
     ids = parse_ascii(Span(Source(name, text), 0, len(text)), elements, reporter)
     reporter.raise_if_errors()
@@ -83,13 +84,13 @@ def load_ascii(path: str | Path, elements: Sequence[Element]) -> NDArray[np.uint
 
 
 def write_ascii(ids: Any, elements: Sequence[Element]) -> str:
-    """Rows of characters for ids [H, W], each with a line break. `read_ascii` with the same elements reverses this."""
+    """Rows of characters for ids [H, W], each with a line break. `read_ascii` is the inverse."""
     characters = {number: character for character, number in _characters(elements, {}).items()}
     return "".join("".join(map(characters.__getitem__, row)) + "\n" for row in ids.tolist())
 
 
 def ids_by_name(elements: Sequence[Element]) -> dict[str, int]:
-    """Ids by plain and qualified name."""
+    """Element ids by plain and qualified name."""
     ids = {element.qualified: element.id for element in elements}
     return ids | {element.name: element.id for element in elements}
 

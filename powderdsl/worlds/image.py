@@ -1,4 +1,4 @@
-"""Worlds from PNG pictures, one pixel a cell, by the elements' exact colors."""
+"""Worlds from PNG pictures, one pixel per cell, by the elements' exact colors."""
 
 from __future__ import annotations
 
@@ -18,21 +18,21 @@ from powderdsl.system.writing import failure
 from powderdsl.worlds.raster import MAX_CELLS
 
 MAX_REPORTED = 8
-"""The most wrong colors that are reported separately. A smoothed picture has thousands."""
+"""Maximum number of wrong colors reported separately: a smoothed picture has thousands."""
 
 _MODES = ("1", "L", "LA", "P", "RGB", "RGBA")
-"""Pixel formats of at most eight bits: other formats have colors that no element can have."""
+"""Pixel formats of at most eight bits; others have colors that no element can have."""
 
 
 def read_image(path: str | Path, elements: Sequence[Element]) -> NDArray[np.uint8]:
     """The ids uint8 [H, W] of a PNG file, such as `worlds.media.write_png` writes from `simulation.draw.rgb`.
 
-    Colors of a ramp mean its element; the values of its field are not read. Raises CompileError: PD609 for pixel colors
-    without an element, PD607 for too many pixels, PD602 for a file that is not a PNG, PD101 for a file that cannot be
-    read; PD612 if Pillow or NumPy is missing.
+    Colors of a ramp are read as its element, without the value of its field. Raises CompileError: PD609 for pixel
+    colors without an element, PD607 for too many pixels, PD602 for a file that is not a PNG, PD101 for a file that
+    cannot be read; PD612 if Pillow or NumPy is missing.
     """
     path = Path(path)
-    # Four bytes a pixel as one number: red lowest, opacity highest.
+    # The four bytes of a pixel as one number: red lowest, opacity highest.
     packed = _pixels(path).view("<u4")[..., 0]
     owners: dict[int, list[Element]] = {}
     for element in elements:
@@ -54,7 +54,7 @@ def read_image(path: str | Path, elements: Sequence[Element]) -> NDArray[np.uint
 def _wrong_colors(
     path: Path, packed: NDArray[np.uint32], known: NDArray[np.bool_], owners: dict[int, list[Element]]
 ) -> list[Diagnostic]:
-    """Reports of unknown colors, in the order of their first pixels."""
+    """Diagnostics of unknown colors, in the order of their first pixels."""
     wrong = np.flatnonzero(~known)
     colors, first, counts = np.unique(packed.reshape(-1)[wrong], return_index=True, return_counts=True)
     result = []
@@ -73,7 +73,7 @@ def _pack(color: bytes) -> int:
 
 
 def _pixels(path: Path) -> NDArray[np.uint8]:
-    """The picture as uint8 [H, W, 4], red, green, blue, opacity."""
+    """The picture as uint8 [H, W, 4]: red, green, blue, opacity."""
     require("numpy", "reading a picture", "pip install numpy")
     images = require("PIL.Image", "reading a picture", "pip install pillow")
     try:

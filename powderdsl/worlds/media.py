@@ -1,4 +1,4 @@
-"""Pictures and animations on disk: PNG, GIF, MP4. Frames are uint8 [H, W, 3]. Files are written whole or not at all."""
+"""Pictures and animations on disk: PNG, GIF, MP4. Frames are uint8 [H, W, 3]. Files are written atomically."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def write_gif(path: str | Path, frames: Iterable[Any], *, fps: float = 30) -> No
 
     Args:
         frames: at least one, arrays or tensors, from an iterable that may be lazy.
-        fps: frames a second; above 50 counts as 50.
+        fps: frames per second, at most 50.
 
     Raises:
         CompileError: PD612 if NumPy or Pillow is not installed, PD613 if the file cannot be written.
@@ -60,10 +60,11 @@ def write_gif(path: str | Path, frames: Iterable[Any], *, fps: float = 30) -> No
 
 
 def gif(worlds: Iterable[World], path: str | Path, *, fps: float = 30, scale: int | None = None) -> None:
-    """Write worlds one after the other, such as `Simulator.frames`, as an endless animation. Batches stand side by side.
+    """Write a sequence of worlds, such as `Simulator.frames`, as an endless GIF. The worlds of a batch are drawn side
+    by side.
 
     Args:
-        fps: frames a second, at most 50. scale: pixels a cell, see `World.picture`.
+        fps: frames per second, at most 50. scale: pixels per cell, see `World.picture`.
 
     Raises:
         CompileError, ValueError: as `write_gif`.
@@ -81,7 +82,7 @@ def write_mp4(path: str | Path, frames: Iterable[Any], *, fps: float = 30) -> No
         fps: frames a second.
 
     Raises:
-        CompileError: PD612 if imageio-ffmpeg is not installed, PD613 with the encoder's own words if it fails.
+        CompileError: PD612 if imageio-ffmpeg is not installed, PD613 with the encoder's message if it fails.
         ValueError: there is no frame.
     """
     helps = ("pip install 'powderdsl[video]'", "or write a .gif, which needs nothing")
@@ -104,7 +105,7 @@ def _first(pictures: Iterator[Any]) -> Any:
 
 _ENCODING = (
     "-an -vcodec libx264 -crf 18 -pix_fmt yuv420p -f mp4 -movflags +faststart"
-    # Without these words players guess how to turn the colors back, and get them slightly wrong.
+    # Without these options, players guess the color conversion and get it slightly wrong.
     " -vf scale=out_color_matrix=bt709:out_range=tv -colorspace bt709"
     " -color_primaries bt709 -color_trc bt709 -color_range tv"
 )
@@ -113,7 +114,7 @@ _ENCODING = (
 def _encode(command: list[str], frames: Iterable[NDArray[np.uint8]]) -> None:
     """Feed frames to an encoder and raise OSError if it fails.
 
-    Not imageio_ffmpeg's own writer, which ignores the exit status: a full disk would leave a broken file.
+    The writer of imageio_ffmpeg ignores the exit status, so a full disk would leave a broken file.
     """
     with tempfile.TemporaryFile() as log:
         encoder = None
@@ -123,7 +124,7 @@ def _encode(command: list[str], frames: Iterable[NDArray[np.uint8]]) -> None:
             with delay_signal():
                 encoder = subprocess.Popen(command, stdin=subprocess.PIPE, stderr=log, start_new_session=True)
             assert encoder.stdin is not None
-            # If the encoder died, its log has the reason.
+            # If the encoder fails, its log has the reason.
             with suppress(BrokenPipeError), encoder.stdin as pipe:
                 for frame in frames:
                     pipe.write(np.ascontiguousarray(frame).data)
@@ -141,8 +142,8 @@ def _encode(command: list[str], frames: Iterable[NDArray[np.uint8]]) -> None:
 
 def _indexed(images: Any, frame: NDArray[np.uint8]) -> Any:
     """A frame with its own palette, exact if it has at most 256 colors."""
-    # Cells are squares of pixels: rows and columns that repeat the one before have no other colors. Sorting all
-    # pixels would take longer than the simulation.
+    # Cells are squares of pixels, so repeated rows and columns add no colors. Sorting all pixels would take longer than
+    # the simulation.
     rows = np.append(True, (frame[1:] != frame[:-1]).any(axis=(1, 2)))
     cells = frame[rows]
     columns = np.append(True, (cells[:, 1:] != cells[:, :-1]).any(axis=0).any(axis=1))

@@ -15,10 +15,10 @@ from powderdsl.arrays import NDArray, np
 from powderdsl.diagnostics import Span
 
 MAX_CELLS = 1 << 24
-"""The largest world that is read or drawn: 4096×4096 cells, or the same number in another shape."""
+"""Maximum number of cells of a world that is read or drawn: 4096×4096."""
 
 MAX_COORDINATE = 1 << 24
-"""Coordinates, widths and radii lie within ±MAX_COORDINATE, so that int64 holds every product below."""
+"""Coordinates, widths and radii are within ±MAX_COORDINATE, so that every product below fits in int64."""
 
 FAR = 1 << 40
 """A number beyond every row."""
@@ -68,7 +68,7 @@ class Setting:
 
 
 def mask(shape: Shape, size: Size) -> NDArray[np.bool_]:
-    """The cells of a shape in a grid of `size`, bool [H, W]. Cells outside the grid are cut off."""
+    """The cells of a shape in a grid of `size`, bool [H, W], without cells outside the grid."""
     if shape.kind == "frame":
         cells = np.ones(size, dtype=np.bool_)
         cells[1:-1, 1:-1] = False

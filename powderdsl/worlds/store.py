@@ -1,4 +1,4 @@
-"""Saved worlds, as .npz or JSON: a palette of qualified names lets them load into rulesets with other ids."""
+"""Saved worlds, as .npz or JSON. A palette of qualified names lets them load into rulesets with other ids."""
 
 from __future__ import annotations
 
@@ -30,15 +30,14 @@ CLOCK = ("seed", "index", "step")
 MAX_ABOUT = 1 << 20
 """Bytes of the header `about` of a file."""
 MORE = 1 << 24
-"""Bytes of arrays allowed beyond twice the size of the worlds, for fields of packs that are not loaded."""
+"""Bytes of arrays allowed in excess of twice the size of the worlds, for fields of packs that are not loaded."""
 
 
 def save(world: World, path: str | Path) -> None:
-    """Write worlds with their state, seeds, indices and steps as .npz. The file appears whole or not at all.
+    """Write worlds with their state, seeds, indices and steps as .npz, atomically.
 
     Raises:
-        CompileError: PD613 if the folder cannot be written or the disk is full, PD607 if there are more than
-            MAX_CELLS cells.
+        CompileError: PD613 if the file cannot be written, PD607 if there are more than MAX_CELLS cells.
         TypeError: `world` is not a World.
     """
     if not isinstance(world, World):
@@ -72,21 +71,21 @@ def load_world(
     batch: int | None = None,
     seed: int | None = None,
 ) -> World:
-    """Worlds from a saved .npz, or fresh ones from a scene, a drawing (.txt) or a picture (.png).
+    """Load saved worlds (.npz), or create worlds from a scene, a drawing (.txt) or a picture (.png).
 
-    The simulator's ruleset may number the elements of a saved world differently.
+    The simulator's ruleset may assign other ids to the elements of a saved world.
 
     Args:
         path: a file, ``FILE.yaml#NAME`` for one of several scenes, or a shipped scene's name such as ``"garden"``.
         size: (rows, columns) instead of the scene's.
-        batch: how many worlds start from a drawn one, 1 if not given.
-        seed: of the random numbers of fresh worlds, 0 if not given.
+        batch: number of copies of a drawn world; 1 by default.
+        seed: seed of new worlds; 0 by default.
 
     Raises:
         CompileError: PD602 if the file is not a world; PD603 or PD604 if the ruleset lacks one of its elements or fields;
             PD607 if it has more than MAX_CELLS cells; what `load_start` raises.
         TypeError: `sim` is not a simulator.
-        ValueError: a saved world has its own size, batch and seed, a picture its own size.
+        ValueError: `size`, `batch` or `seed` is given for a saved world, or `size` for a picture.
     """
     if not isinstance(sim, Simulator):
         raise TypeError(f"load_world takes a Simulator, from powderdsl.compile; found {type(sim).__name__}")
@@ -121,7 +120,7 @@ def drawn_world(name: str, ruleset: Ruleset, size: Size | None) -> Start:
         return Start(read(name, ruleset.elements), {})
     if suffix not in (".yaml", ".yml"):
         if Path(name).is_file():
-            raise failure("PD602", f"cannot tell what {name} is", helps=(KINDS,))
+            raise failure("PD602", f"unknown kind of world file: {name}", helps=(KINDS,))
         if re.search(r"\.[A-Za-z0-9]{1,5}\Z", name):
             raise failure("PD601", f"no world {name}", helps=(KINDS,))
     return load_start(name, ruleset, size=size)
@@ -137,7 +136,7 @@ def fresh_world(sim: Simulator, start: Start, seed: int) -> World:
 
 
 def _load(archive: Archive, sim: Simulator, source: Path) -> World:
-    """Worlds from an archive. Raises BadArchive, or LookupError, TypeError or ValueError for malformed values."""
+    """Worlds from an archive. Raises BadArchive, and LookupError, TypeError or ValueError for malformed values."""
     palette, qualified, saved_in = _about(archive)
     shape = _shape(archive, sim, source)
     clock = {name: _clock(archive, name) for name in CLOCK}

@@ -10,7 +10,7 @@ from powderdsl.system.writing import failure
 from powderdsl.worlds.raster import MAX_CELLS, Shape, Size, mask
 
 MAX_TOTAL = 16 * MAX_CELLS
-"""Cells of all worlds that are made at once."""
+"""Maximum number of cells of all worlds together."""
 
 
 def check_cells(batch: int, size: tuple[int, ...]) -> None:
@@ -21,11 +21,11 @@ def check_cells(batch: int, size: tuple[int, ...]) -> None:
 
 
 def strew(ruleset: Ruleset, size: Size, batch: int, seed: int) -> NDArray[np.uint8]:
-    """Worlds of shapes at random places, uint8 [batch, H, W]: world i depends only on `seed` and i.
+    """Worlds of randomly placed shapes, uint8 [batch, H, W]. World i depends only on `seed` and i.
 
-    The ground is the element with the lowest id. Over it are 24 disks, boxes and lines of the other elements, each solid
-    or with a random half of its cells. If any element moves and another never changes, the first unchanging element frames
-    the world, so that nothing falls out of it. Raises CompileError as `check_cells`.
+    The background is the element with the lowest id. On it are 24 disks, boxes and lines of the other elements, each
+    solid or with a random half of its cells. If any element moves and another never changes, the first unchanging
+    element frames the world, so that nothing leaves it. Raises CompileError as `check_cells`.
     """
     height, width = size
     check_cells(batch, size)

@@ -76,9 +76,9 @@ def test_many_options_are_in_sections():
 def test_help_has_the_defaults_of_presets():
     help_text = " ".join(powderdsl("train", "--help").stdout.split())
     assert "[paper: 256, small: 128, fcn: 32]" in help_text
-    assert "Worlds that are played at once. [default: 32]" in help_text
+    assert "Number of parallel worlds. [default: 32]" in help_text
     help_text = " ".join(powderdsl("wm", "train", "--help").stdout.split())
-    assert "Features of the first block. [paper: 32, small: 16]" in help_text
+    assert "Number of features of the first block. [paper: 32, small: 16]" in help_text
     assert "..." not in powderdsl("wm", "--help").stdout.partition("Commands:")[2]
 
 
@@ -112,7 +112,7 @@ def failing(monkeypatch: pytest.MonkeyPatch, error: BaseException, **environment
         (
             ZeroDivisionError("by 0"),
             exits.INTERNAL,
-            "error[PD901]: a mistake in powderdsl itself: ZeroDivisionError: by 0",
+            "error[PD901]: a bug in powderdsl: ZeroDivisionError: by 0",
         ),
         (ValueError("a mistake of ours"), exits.INTERNAL, "please report it"),
         (

@@ -82,7 +82,7 @@ def test_what_rules_name_is_reported(folder):
     """Of other packs, the number of tests that pass, and what is wrong."""
     (folder / "grit.yaml").write_text(PACK + TESTS)
     for rules, own, counted in [
-        ("core+water+grit.yaml", "grit", "grit.yaml: 1 of 1 rule happened"),
+        ("core+water+grit.yaml", "grit", "grit.yaml: 1 of 1 rule fired"),
         ("water", "water", "rules/water.yaml: "),
     ]:
         lines = powderdsl("test", rules, "--examples", 0, exits=0).stdout.splitlines()

@@ -50,7 +50,7 @@ def test_an_ended_command_leaves_nothing_behind_and_the_next_one_works(
                 assert "Traceback" not in place.said()
                 assert place.scratch() == [], place.said()
                 if name in ("train", "wm train", "study", "record"):
-                    assert "the same command continues in" in place.said()
+                    assert "run the same command again to resume" in place.said()
                 if name in ("train", "wm train", "study"):
                     assert any(tmp_path.rglob("*.safetensors"))
         assert waited(lambda: not place.survivors(), 60)

@@ -14,7 +14,7 @@ DETAILS: list[tuple[str, str, str, str | None]] = [
     ('a color from a short one', 'also: {weed: {color_by: {field: age, from: "#FFF", to: "#FF0000"}}}\n', 'PD110', '"#FFF"'),
     ('a color over a number', 'also: {weed: {color_by: {field: age, to: "#FF0000", over: 9}}}\n', 'PD401', '9'),
     ('a color over fractions', 'also: {weed: {color_by: {field: age, to: "#FF0000", over: 0.5..3}}}\n', 'PD405', '0.5'),
-    ('a color over a range that runs backwards', 'also: {weed: {color_by: {field: age, to: "#FF0000", over: 9..0}}}\n', 'PD402', '9..0'),
+    ('a color over the bounds are reversed', 'also: {weed: {color_by: {field: age, to: "#FF0000", over: 9..0}}}\n', 'PD402', '9..0'),
     ('a color over a range that the field does not reach', 'also: {weed: {color_by: {field: age, to: "#FF0000", over: 0..10}}}\n', 'PD402', '0..10'),
     ('a color over one value', 'also: {weed: {color_by: {field: age, to: "#FF0000", over: 3..3}}}\n', 'PD402', '3..3'),
     ('a color over a list', 'also: {weed: {color_by: {field: age, to: "#FF0000", over: [0, 9]}}}\n', 'PD107', '[0, 9]'),

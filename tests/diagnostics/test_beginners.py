@@ -66,7 +66,7 @@ RULES = [
     ("soil -> weed if count(soil in disc) > 2", "PD406", "disc", "soil -> weed if count(soil in disc(3)) > 2", "`disc(3)`"),
     # characters that only look right
     ("soil -> weed if count(s\u043eil) > 1", "PD201", "\u043e", "soil -> weed if count(soil) > 1", "`o`"),
-    ("soil\u00a0-> weed", "PD201", "\u00a0", "soil -> weed", "a plain blank"),
+    ("soil\u00a0-> weed", "PD201", "\u00a0", "soil -> weed", "a plain space"),
     ("heat := heat \u2212 1 where soil", "PD201", "\u2212", "heat := heat - 1 where heat > 0", "`-`"),
     ("soil \u2013> weed", "PD201", "\u2013", "soil -> weed", "`-`"),
     ("so\u200bil -> weed", "PD201", "\u200b", "soil -> weed", "remove it"),
@@ -154,7 +154,7 @@ def test_a_pack_that_others_need_is_missed_once() -> None:
     assert result.output.count("error[") == 1
     assert "which is not loaded" in result.output
     assert "did you mean" not in result.output
-    assert "leave out what needs it too: `-sand`, " in result.output
+    assert "also leave out the packs that need it: `-sand`, " in result.output
 
 
 @pytest.mark.parametrize("setting", ["500%", "2", "-5%"])

@@ -72,7 +72,7 @@ def test_rules_that_are_too_hard_are_called_undecided() -> None:
     [(code, helps)] = reported("    do:\n" + listed(sums, 6))
     assert code == "PD502"
     assert helps == (
-        "choose what happens if they do: `conflicts: first_wins`",
+        "choose the outcome if they can: `conflicts: first_wins`",
         "or put one of them under `then:`",
     )
     assert reported("    conflicts: first_wins\n    do:\n" + listed(sums, 6)) == []

@@ -292,7 +292,7 @@ def test_rules_that_a_task_does_not_fit_are_refused(mixed: Path) -> None:
     place.write_text(MIXED.replace("p2.yaml]", "p8.yaml]"), encoding="utf-8")
     checked = run("check", str(place), exits=2).output
     assert "unknown element `crust`" in checked
-    assert "note: the split gives worlds the rules " in checked
+    assert "note: worlds of the split have the rules " in checked
     place.write_text(MIXED.replace("p2.yaml]", "p9.yaml]"), encoding="utf-8")
     env = environment(place, 3, backend="wasm")
     with pytest.raises(ValueError, match=r"observations or actions are others under .*p9"):
@@ -343,7 +343,7 @@ def test_evaluations_and_recordings_follow_the_rulesets(mixed: Path, tmp_path: P
 @pytest.mark.parametrize(
     ("change", "code", "text"),
     [
-        ("melt: 1%..40%", "PD807", "the split `test` draws values of `water.melt` that `train` draws too"),
+        ("melt: 1%..40%", "PD807", "the ranges of `water.melt` in `test` and in `train` overlap"),
         ("melt: 1%..200%", "PD402", "the parameter `water.melt` cannot be `1%..200%`"),
         ("melt: 40%..1%", "PD402", "the parameter `water.melt` cannot be `40%..1%`"),
         ("melt: ..5%", "PD402", "the parameter `water.melt` cannot be `..5%`"),

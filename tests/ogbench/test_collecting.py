@@ -150,7 +150,7 @@ def test_missing_and_damaged_data_are_named(data: Path, tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError, match="powderdsl ogbench easy --out"):
         make_env_and_datasets(NAME, dataset_dir=tmp_path, dataset_only=True)
     for name in ("powderworld-easy-v0", "powderworld-simple-play-v0", "antmaze-large-play-v0", ""):
-        with pytest.raises(ValueError, match="no data set named"):
+        with pytest.raises(ValueError, match="no dataset named"):
             make_env_and_datasets(name, env_only=True)
     whole = (data / f"{NAME}.npz").read_bytes()
     path = tmp_path / "damaged.npz"

@@ -110,7 +110,7 @@ def test_a_ruleset_renames_without_editing_anyones_file() -> None:
     assert "damp" in [field.name for field in rules.fields]
     assert "crawl" in [one.name for one in rules.passes]
     assert {note.message for note in notes if note.code == "PD312"} == {
-        "the tag `sticky` of `two` is known as `two.sticky` here"
+        "the tag `sticky` of `two` is named `two.sticky` here"
     }
     Path("garden.yaml").write_text("ruleset: garden\npacks: [core, one]\nrename: {one.slim: ooze}\n")
     assert refused_codes(powderdsl.load, "garden.yaml") == ["PD310"]

@@ -42,7 +42,7 @@ def test_a_pack_that_stands_in_for_another_is_enough() -> None:
 def test_what_is_left_out_is_not_loaded_again() -> None:
     with pytest.raises(CompileError, match="PD305") as caught:
         powderdsl.load("powderworld-sand+packs/seed.yaml")
-    assert "leave out what needs it too: `-loam`" in str(caught.value)
+    assert "also leave out the packs that need it: `-loam`" in str(caught.value)
 
 
 def test_a_pack_that_nobody_has_is_missing(packs: Path) -> None:

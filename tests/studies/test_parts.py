@@ -130,7 +130,7 @@ def test_shards_are_collected_with_the_same_selection(steps_run: list[str]) -> N
     for number in (1, 2, 3):
         shard = ("--shard", f"{number}/3", "--out", f"part{number}")
         found = powderdsl("study", "study.yaml", *shard, *chosen, exits=0)
-        assert "other parts have 8 combinations that are not done in part" in found.stdout
+        assert "8 combinations of other parts are not done in part" in found.stdout
         assert not Path(f"part{number}/results.md").exists()
     assert len(steps_run) == 2 * POINTS
     collected = powderdsl("study", "collect", "part2", "part1", "part3", "--out", "all", *chosen, exits=0)
@@ -227,7 +227,7 @@ def test_points_that_others_hold_are_left_to_them(steps_run: list[str], quick: N
     place.mkdir()
     with FileLock(place / ".lock"):
         result = powderdsl("study", "study.yaml", "--out", "out", exits=1)
-        assert "the study is not complete: other processes hold 1 combination" in result.stderr
+        assert "the study is not complete: other processes are running 1 combination" in result.stderr
         assert f"{place.name}: another process works on it" in result.stderr
         assert len(steps_run) == POINTS - 1
         assert place.name not in steps_run

@@ -201,7 +201,7 @@ def test_a_network_is_tested_on_another_recording_of_the_task(copy: Path) -> Non
     ("words", "said"),
     [
         (("train", "--data", "nowhere"), "PD630"),
-        (("train", "--data", "ids"), "give its file, too"),
+        (("train", "--data", "ids"), "pass its file, too"),
         (("train", "--data", "ids", "sand-pushing"), "does not fit the task sand-pushing"),
         (("train", "--data", "ids", "builders.yaml", "--worlds", 10), "--worlds selects worlds"),
         (("train", "--data", "ids", "--held-out", "sand"), "--held-out selects worlds"),

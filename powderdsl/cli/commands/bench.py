@@ -56,7 +56,7 @@ EPILOG = "\b\nWorkloads:\n" + "\n".join(f"  {name:<7} {about}" for name, about i
 @opt.option(
     "--beside",
     click.Path(exists=True, dir_okay=False, path_type=Path),
-    "Also measure a program of yours that makes the same steps: `load(state)` returns `run(steps)`.",
+    "Also measure your own program that makes the same steps: `load(state)` returns `run(steps)`.",
     to="programs",
     metavar="FILE.py",
     multiple=True,
@@ -65,7 +65,7 @@ EPILOG = "\b\nWorkloads:\n" + "\n".join(f"  {name:<7} {about}" for name, about i
 @opt.device
 @opt.option("--steps", (1, 1 << 20), "Maximum steps per call.", Plan.steps)
 @opt.option("--seconds", SECONDS, "Measuring time per combination, in seconds.", Plan.seconds)
-@opt.option("--rounds", (1, 1000), "Rounds: in each, all combinations are measured in turn.", Plan.rounds)
+@opt.option("--rounds", (1, 1000), "Number of rounds; each measures all combinations in turn.", Plan.rounds)
 @opt.option("--seed", (0, 2**63 - 1), "Seed of the start worlds.", Plan.seed)
 @opt.parameters
 @opt.option("--profile", bool, "Also measure the time of each pass.")
@@ -83,8 +83,8 @@ def command(
 ) -> int:
     """Measure how fast rules run.
 
-    --backend, --batch, --size and --threads may be repeated. All their combinations are measured, in
-    turn, round after round, and medians are shown. With --check, a backend that does not run gets a row that says why.
+    --backend, --batch, --size and --threads may be repeated. Each round measures all combinations in turn; the table
+    shows medians. With --check, a backend that cannot run gets a row with the reason.
     """
     ruleset = opt.load_rules(rules, settings)
     with user_values():
@@ -110,7 +110,7 @@ def command(
 
 
 def _usual_backends(device: str, check: bool) -> tuple[str, ...]:
-    """The default backends: the one that starts at once, and the fastest for the device; to `check` a GPU, all there are."""
+    """The default backends: the one that starts instantly and the fastest on the device; with `check` on a GPU, all."""
     from powderdsl.simulation.programs import starting_backend
 
     first = starting_backend(device)

@@ -14,16 +14,16 @@ from powderdsl.system.reports import table
 
 @click.group("cache")
 def command() -> None:
-    """List or remove the compiled code that this machine keeps, or print its folder.
+    """List or remove the compiled code cached on this machine, or print its folder.
 
-    Rules are checked, lowered and compiled once for each version of their text. The results are private to the user.
-    Beyond 512 MB, those that were used least recently are removed, except what `torch-fused` has compiled.
+    Rules are checked, lowered and compiled once for each version of their text. Only the user can read the results.
+    Above 512 MB, the least recently used are removed, except those of `torch-fused`.
     """
 
 
 @command.command("list")
 def list_entries() -> None:
-    """List the files of compiled code, the most recently used first; `torch-fused` has one line for all of its own."""
+    """List cached files, the most recently used first; those of `torch-fused` share one line."""
     stored = sorted([*entries(compiled_folder()), *fused_code()], key=lambda entry: -entry.used)
     rows = [["code of", "size", "last used"]]
     for entry in stored:
@@ -36,7 +36,7 @@ def list_entries() -> None:
 
 @command.command("clear")
 def clear_entries() -> None:
-    """Remove compiled code. Running programs continue; code is compiled again when it is next needed."""
+    """Remove compiled code. Running programs continue; code is recompiled when needed."""
     removed = [*clear(compiled_folder()), *fused_code(remove=True)]
     click.echo(f"removed {counted(len(removed), 'file')}, {_megabytes(removed)}", err=True)
 

@@ -1,4 +1,4 @@
-"""`powderdsl check`: every mistake in rule files, and every invariant that is easily broken."""
+"""`powderdsl check`: report every mistake in rule files and every easily broken invariant."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
 
 ALWAYS_SHOWN = ("PD515", "PD518")
-"""Note codes that are always printed, one line each: effects of added packs, undecided invariants."""
+"""Codes of notes that are always printed, one line each: effects of added packs, undecided invariants."""
 
 
 @dataclass(frozen=True)
@@ -45,7 +45,7 @@ class Checked:
     cost: tuple[PassCost, ...] | None = None
     ledger: Ledger | None = None
     claims: tuple[dict[str, Any], ...] = ()
-    """The verdicts on invariants, as JSON; with the line that shows each."""
+    """The verdicts on invariants as JSON, and the line that shows each."""
 
     def number(self, severity: Severity) -> int:
         return sum(diagnostic.severity is severity for diagnostic in self.diagnostics)
@@ -54,13 +54,13 @@ class Checked:
 @click.command("check")
 @click.argument("rules", nargs=-1, required=True, metavar="RULES...")
 @opt.option("--json", bool, "One JSON list instead of text.", to="as_json")
-@opt.option("--fix", bool, "Correct misspelled words, if that leaves fewer errors.")
+@opt.option("--fix", bool, "Fix misspelled words if that reduces the number of errors.")
 @opt.option("--notes", bool, "Also list notes, such as inactive rules.")
 @opt.option("--warnings-as-errors", bool, "Exit with 1 if there are warnings.")
-@opt.option("--quick", bool, "Check only the rules themselves; do not judge invariants.")
+@opt.option("--quick", bool, "Check only the rules, not invariants.")
 @opt.proof
 @opt.option("--claims", bool, "Also list each invariant: proven, refuted or tested; in JSON as a key.")
-@opt.option("--cost", bool, "Also report what each pass costs; in JSON as a second key.")
+@opt.option("--cost", bool, "Also report the cost of each pass; in JSON as a key.")
 @opt.option("--ledger", bool, "Also report what rules create, destroy and move; in JSON as a key.")
 def command(
     rules: tuple[str, ...],
@@ -74,14 +74,14 @@ def command(
     cost: bool,
     ledger: bool,
 ) -> int:
-    """Find the mistakes in rule files and tasks, all at once, and invariants that do not hold.
+    """Find all mistakes in rule files and tasks, and invariants that do not hold.
 
-    Invariants are proven where that is possible, else tried on a few small worlds.
+    Invariants are proven if possible, and otherwise tried on a few small worlds.
 
-    Each RULES is checked by itself; packs that belong together are joined by `+`: core+my/pack.yaml. A task is
-    a shipped one by name, or a file that begins with `task:`.
+    Each RULES is checked separately; join packs that belong together by `+`: core+my/pack.yaml. A task is the name of a
+    shipped one, or a file that begins with `task:`.
 
-    Exit code: 0 without errors, 1 with warnings under --warnings-as-errors, 2 with errors.
+    Exit code: 0 without errors, 1 for warnings with --warnings-as-errors, 2 for errors.
     """
     checks = [partial(_check, name, None if quick else prove, cost, ledger) for name in rules]
     results = [check() for check in checks]
@@ -142,7 +142,7 @@ def _check(name: str, prove: int | None, cost: bool, ledger: bool) -> Checked:
             from powderdsl.tasks.shipped import load_task_with_diagnostics  # brings numpy
 
             task, diagnostics = load_task_with_diagnostics(name)
-            for split in task.splits:  # those between the first and the last are of the same kind
+            for split in task.splits:  # those in between are of the same kind
                 for rules in dict.fromkeys(split.rulesets[:1] + split.rulesets[-1:]):
                     task_under(task, rules)
             return Checked(name, diagnostics, task)
@@ -163,7 +163,7 @@ def _check(name: str, prove: int | None, cost: bool, ledger: bool) -> Checked:
 
 
 def _corrected(result: Checked, check: Callable[[], Checked], quiet: bool) -> Checked | None:
-    """Correct misspelled words; return the new result, or None, with files as before, if it has no fewer errors."""
+    """Fix misspelled words. Return the new result, or None (and leave the files unchanged) without fewer errors."""
     wrong = [diagnostic for diagnostic in result.diagnostics if diagnostic.fix]
     keys = [diagnostic for diagnostic in wrong if diagnostic.code == "PD108"]  # names depend on keys
     fixes = dict(diagnostic.fix for diagnostic in keys or wrong if diagnostic.fix)
@@ -188,7 +188,7 @@ def _corrected(result: Checked, check: Callable[[], Checked], quiet: bool) -> Ch
 
 
 def _judged(ruleset: Ruleset, prove: int) -> tuple[tuple[Diagnostic, ...], tuple[dict[str, Any], ...]]:
-    """What is wrong with invariants, and the verdict on each."""
+    """Diagnostics about invariants, and the verdict on each."""
     from powderdsl.testing.properties.outcomes import result_data, result_line
     from powderdsl.testing.properties.search import quick_results, refuted  # brings numpy
 
@@ -214,11 +214,11 @@ def _cost_lines(passes: tuple[PassCost, ...]) -> Iterator[str]:
     for cost in passes:
         if cost.form == "cells":
             yield f"{cost.name}: {cost.dense:,} operations on cells, not on planes: {cost.why} ({cost.place})"
-    yield "For every cell and step, if nothing is skipped. Shares are estimates."
+    yield "Per cell and step, if no pass is skipped. Shares are estimates."
 
 
 def _summary(result: Checked, notes: bool) -> str:
-    """`name: 14 elements, 12 passes, no errors`, and how many warnings and notes there are."""
+    """`name: 14 elements, 12 passes, no errors`, and the numbers of warnings and notes."""
     loaded, parts = result.loaded, []
     if isinstance(loaded, Ruleset):
         parts += [counted(len(loaded.elements), "element"), counted(len(loaded.passes), "pass", "passes")]

@@ -31,7 +31,7 @@ STAGES = ("tree", "model", "ir", "planes", "schedule", "kernels")
     to="stage",
     required=True,
 )
-@opt.backend("auto", "Whose schedule or kernels are printed.")
+@opt.backend("auto", "Backend whose schedule or kernels are printed.")
 @opt.option("--after", "STAGE", "Print the schedule after this stage of the planner.  [default: the last]")
 @opt.option("--pass", "NAME", "Print only this pass of the rules.", to="pass_name")
 @opt.parameters
@@ -99,11 +99,11 @@ def _schedules(
 
 
 SHOWN_WIDTH, SHOWN_SHARED = 64, 227 << 10
-"""Columns of the grid, and bytes of shared memory of the GPU, for which kernels are shown."""
+"""The grid's columns, and the GPU's bytes of shared memory, for which kernels are shown."""
 
 
 def _kernels(program: Program, backend: str, pass_name: str | None) -> Iterator[str]:
-    """The generated source of a backend: part by part, where planes cannot carry all passes."""
+    """The generated source of a backend; in parts if some passes cannot run on bit planes."""
     from powderdsl.ir.bits import segments
     from powderdsl.targets.torch.source import kernel_source
 

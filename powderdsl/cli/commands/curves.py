@@ -14,12 +14,12 @@ from powderdsl.cli.exits import BadInput
 @click.command("curves")
 @click.argument("runs", metavar="RUN…", nargs=-1, required=True)
 @opt.option("--metric", opt.NAMES, "Numbers of metrics.jsonl.", "held_out/return", to="metrics")
-@opt.output("--out", "FILE", "The picture to write; without it, a table is printed.")
+@opt.output("--out", "FILE", "Picture to write; without it, print a table.")
 def command(runs: tuple[str, ...], metrics: tuple[str, ...], out: Path | None) -> None:
     """Show what agents or world models learned, step by step.
 
-    Runs that differ only in their seed make one curve: the mean, with its 95 % interval. For agents, train with
-    --eval-every and evaluate one run: its expert, random and do-nothing policies become lines.
+    Runs that differ only in their seed form one curve: the mean with its 95 % interval. For agents, train with
+    --eval-every and evaluate one run: its expert, random and do-nothing policies are drawn as lines.
     """
     from powderdsl.experiments.runs import find_run, read_metrics
     from powderdsl.experiments.studies.results import as_table, baselines_of, curves_of, write_curves

@@ -21,17 +21,17 @@ if TYPE_CHECKING:
 @opt.option(
     "--policies",
     opt.NAMES,
-    "Policies among trained, expert, random, nothing.  [default: all; an expert that searches only if named]",
+    "Policies: trained, expert, random, nothing.  [default: all, except an expert that searches]",
 )
 @opt.option("--episodes", (1, 10**6), "Episodes per split and policy.", 256)
 @click.option(
-    "--deterministic/--sampled", default=False, help="Take the likeliest action, or draw one as in training."
+    "--deterministic/--sampled", default=False, help="Take the likeliest action, or sample as in training."
 )
-@opt.option("--seed", (0, 2**32 - 1), "Seed of what policies draw.", 0)
+@opt.option("--seed", (0, 2**32 - 1), "Seed of the policies.", 0)
 @opt.task_options
 @click.option("--backend", type=opt.BACKEND, help="Backend that runs the rules.  [default: the run's]")
 @click.option("--device", help="A torch device.  [default: the run's]")
-@opt.option("--json", bool, "One JSON object instead of a table.", to="as_json")
+@opt.option("--json", bool, "Print one JSON object instead of a table.", to="as_json")
 def command(
     run: str,
     knobs: dict[str, int],
@@ -40,10 +40,9 @@ def command(
     as_json: bool,
     **how: Any,
 ) -> None:
-    """Mean return and 95 % interval of the agent of a RUN, on each split, in the same worlds as the other policies.
+    """Print the mean return and 95 % interval of a RUN's agent and of other policies, on the same worlds of each split.
 
-    The result is also written to evaluation.json in the run's folder. For a TASK,
-    policies that need no training are compared.
+    The result is also written to evaluation.json in the run's folder. For a TASK, only untrained policies are compared.
     """
     played = opt.find_played(run, knobs, settings, packs)
     from powderdsl.rl.evaluation import evaluate
@@ -74,7 +73,7 @@ def _text(evaluation: Evaluation) -> list[str]:
         if count
     ]
     same += [
-        f"{name}: {overlap.worlds} of {worlds[name]} worlds start as a training world does; returns without them: "
+        f"{name}: {overlap.worlds} of {worlds[name]} worlds start like a training world; returns without them: "
         + ", ".join(f"{policy} {estimate}" for policy, estimate in overlap.without.items())
         for name, overlap in evaluation.seen.items()
         if overlap.worlds

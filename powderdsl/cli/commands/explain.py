@@ -19,7 +19,7 @@ PAGE_WIDTH = 100
 def command(code: str | None) -> None:
     """Explain a diagnostic code and how to fix it.
 
-    CODE is a code such as PD301, or its name such as unknown-name. Without one, all codes are listed.
+    CODE is a code such as PD301 or a name such as unknown-name. Without CODE, list all codes.
     """
     if code is None:
         for row in CODES.values():

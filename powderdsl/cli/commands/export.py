@@ -1,4 +1,4 @@
-"""`powderdsl export`: write rules as a WebAssembly module for any page, or a task's environment as C."""
+"""`powderdsl export`: write rules as a WebAssembly module for any web page, or a task's environment as C."""
 
 from __future__ import annotations
 
@@ -22,14 +22,12 @@ from powderdsl.system.writing import replacing, write_text
     "--env", bool, "Write the environment of TASK: a C header, and a .cpp file beside it.", to="as_env"
 )
 @opt.option("--split", "SPLIT", "With --env: the set of worlds.", "train")
-@opt.option("--worlds", (1, 4096), "With --env: how many start worlds of the split.", 64)
+@opt.option("--worlds", (1, 4096), "With --env: number of start worlds.", 64)
+@opt.option("--observation", ("ids", "compact", "matrix", "rgb"), "With --env: form of observations.", "ids")
 @opt.option(
-    "--observation", ("ids", "compact", "matrix", "rgb"), "With --env: what observations show.", "ids"
+    "--actions", ("multidiscrete", "discrete", "full"), "With --env: form of actions.", "multidiscrete"
 )
-@opt.option(
-    "--actions", ("multidiscrete", "discrete", "full"), "With --env: the form of actions.", "multidiscrete"
-)
-@opt.knobs("With --env: another value for a knob.")
+@opt.knobs("With --env: set a knob.")
 @opt.parameters
 def command(
     rules: str,
@@ -40,17 +38,17 @@ def command(
     settings: dict[str, str],
     **how: Any,
 ) -> None:
-    """Write rules as a WebAssembly module, for a page or a game; or a task's environment as C.
+    """Write rules as a WebAssembly module for a web page or game, or a task's environment as C.
 
-    The module is a world of one size. It imports nothing, and a page needs fifteen lines of JavaScript to run it:
-    docs/export.md. An environment is compiled with a program, and its episodes begin in worlds that it contains.
+    The module is a world of a fixed size without imports; docs/export.md shows the fifteen lines of JavaScript that run
+    it. An environment is compiled into your program and contains the worlds in which its episodes begin.
 
     \b
         powderdsl export RULES --out rules.wasm
         powderdsl export --env TASK --out env.h
     """
     if out.suffix.lower() != (".h" if as_env else ".wasm"):
-        raise BadInput(f"{out}: --env writes a .h file, and nothing else does")
+        raise BadInput(f"{out}: --env, and only --env, writes a .h file")
     if as_env:
         if size is not None:
             raise BadInput("--size goes with rules: a task has its own")

@@ -1,4 +1,4 @@
-"""`powderdsl fmt`: one layout for rule files, tasks, scenes and studies."""
+"""`powderdsl fmt`: format rule files, tasks, scenes and studies."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from powderdsl.system.writing import write_text
 
 @click.command("fmt")
 @click.argument("files", nargs=-1, required=True, type=click.Path(path_type=Path), metavar="FILE...")
-@opt.option("--check", bool, "Write nothing; exit with 1 if a file has another layout.")
+@opt.option("--check", bool, "Write nothing; exit with 1 if a file would change.")
 @opt.option("--diff", bool, "Write nothing; print what would change.")
 def command(files: tuple[Path, ...], check: bool, diff: bool) -> int:
-    """Give YAML files of powderdsl one layout: indentation, blanks and blank lines.
+    """Format powderdsl's YAML files: indentation, spaces and blank lines.
 
-    Comments stay, and so does what a file says. Names of files that change are printed.
+    Comments and the meaning of a file are unchanged. Prints the names of changed files.
 
-    Exit code: 0; 1 under --check or --diff if a file has another layout; 2 if one cannot be read.
+    Exit code: 0; 1 with --check or --diff if a file would change; 2 if a file cannot be read.
     """
     from powderdsl.diagnostics import Reporter
     from powderdsl.editing.layout import formatted

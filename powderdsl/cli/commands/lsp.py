@@ -1,4 +1,4 @@
-"""`powderdsl lsp`: a language server, over the standard streams."""
+"""`powderdsl lsp`: a language server over stdin and stdout."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ if TYPE_CHECKING:
 
 
 @click.command("lsp")
-@opt.option("--with", str, "Rules that packs are checked with, besides those they need.", "", to="beside")
+@opt.option("--with", str, "Rules to check packs with, besides those that they need.", "", to="beside")
 def command(beside: str) -> None:
     """Run a language server for editors, over stdin and stdout.
 
-    It reports mistakes while you type, completes and explains words, finds definitions and uses, renames, fixes,
+    It reports mistakes while you type, completes and explains words, finds definitions and uses, and renames, fixes,
     formats and outlines packs, rulesets, tasks, scenes and studies. Editors start this command: see docs/editors.md.
     """
     require("pygls", "lsp")
@@ -110,7 +110,7 @@ def server(beside: str = "") -> Any:
         )
 
     def check(path: Path) -> None:
-        """Publish the mistakes of a file, in every file that they are in."""
+        """Publish the mistakes found from a file, in every file that contains some."""
         own = str(from_fs_path(str(path)))
         by_file: dict[str, list[lsp.Diagnostic]] = {own: []}
         mistakes[path] = files.check(path)

@@ -1,4 +1,4 @@
-"""`powderdsl new`: a first pack to change: an element, a rule and a test."""
+"""`powderdsl new`: write a starter pack with an element, a rule and a test."""
 
 from __future__ import annotations
 
@@ -26,10 +26,10 @@ TEMPLATE = Path(__file__).with_name("first_pack.yaml")
 @click.argument("name")
 @opt.path("--dir", "PATH", "The folder of the new file.", to="folder", default=".")
 def command(name: str, folder: Path) -> None:
-    """Write NAME.yaml, a first pack: an element, a rule and a test. Existing files stay."""
+    """Write NAME.yaml, a starter pack with an element, a rule and a test. Existing files are not overwritten."""
     if not NAME.match(name) or len(name) > MAX_NAME:
         raise BadInput(
-            f"`{name}` cannot name a pack: up to {MAX_NAME} letters, digits and `_`, a letter first"
+            f"`{name}` is not a name for a pack: use up to {MAX_NAME} letters, digits and `_`, a letter first"
         )
     path = folder / f"{name}.yaml"
     if path.exists() or path.is_symlink():
@@ -40,7 +40,7 @@ def command(name: str, folder: Path) -> None:
     color = colorsys.hsv_to_rgb(name_number(name) / 2**32, 0.55, 0.85)
     digits = "".join(f"{round(part * 255):02X}" for part in color)
     text = Template(TEMPLATE.read_text(encoding="utf-8")).substitute(name=name, color=f"#{digits}")
-    # The name may mean something in the language, or in the pack that the new one needs.
+    # The name may be taken by the language or by the required pack.
     reporter = Reporter()
     packs, _ = read(["core"], reporter)
     new = read_file(Source(f"{name}.yaml", text), reporter)

@@ -1,4 +1,4 @@
-"""`powderdsl ogbench`: collect OGBench's data sets of Powderworld."""
+"""`powderdsl ogbench`: collect OGBench's datasets of Powderworld."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from powderdsl.cli.output import counted, progress
 
 @click.command("ogbench")
 @click.argument("level", metavar="LEVEL")
-@opt.path("--out", "FOLDER", "Folder of the files.", required=True)
-@opt.option("--episodes", (1, 1 << 30), "Training episodes.  [default: as many as OGBench has]")
+@opt.path("--out", "FOLDER", "Output folder.", required=True)
+@opt.option("--episodes", (1, 1 << 30), "Training episodes.  [default: as in OGBench]")
 @opt.option("--validation", (1, 1 << 30), "Validation episodes.  [default: a tenth]")
 @opt.option("--seed", (0, (1 << 61) - 1), "Seed of the episodes.", 0)
 @opt.machine
 def command(level: str, out: Path, threads: int, backend: str, device: str, **how: Any) -> int:
-    """Collect the data set of LEVEL, easy, medium or hard: scripted play, in OGBench's files.
+    """Collect the dataset of LEVEL (easy, medium or hard): scripted play, in OGBench's file format.
 
-    The files depend only on the options. After an interruption, the same command continues.
+    The files depend only on the options. After an interruption, the same command resumes.
 
     \b
         powderdsl ogbench easy --out data

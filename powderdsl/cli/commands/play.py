@@ -1,4 +1,4 @@
-"""`powderdsl play`: the playground, a page where worlds are painted and rules rewritten."""
+"""`powderdsl play`: the playground, a page to paint worlds and edit rules."""
 
 from __future__ import annotations
 
@@ -30,9 +30,9 @@ def command(
     export: Path | None,
     settings: dict[str, str],
 ) -> None:
-    """Open a page to paint and run worlds, and to change their rules while they run.
+    """Open a page to paint worlds and change their rules while they run.
 
-    The page is served on this machine only. It runs in the browser: nothing is sent anywhere.
+    The page is served only on this machine and runs in the browser: it sends no data anywhere.
     """
     from powderdsl.web.site import PARTS, Entry, Site
 
@@ -63,7 +63,7 @@ def command(
 
 
 PORT = 8372
-"""Always the same, where it is free: browsers keep work for an address."""
+"""The preferred port: browsers store work by address, port included."""
 
 
 def _serve(site: Site, port: int | None, opens: bool) -> None:

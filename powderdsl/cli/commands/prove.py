@@ -1,4 +1,4 @@
-"""`powderdsl prove`: whether two rulesets are equal, and whether a claim holds in every world."""
+"""`powderdsl prove`: prove that two rulesets are equivalent, or that a claim holds in every world."""
 
 from __future__ import annotations
 
@@ -21,16 +21,16 @@ from powderdsl.model.types import Ruleset
 @opt.proof
 @opt.option("--json", bool, "Print one JSON object.", to="as_json")
 def command(words: tuple[str, ...], prove: int, as_json: bool) -> int:
-    """Prove that two rulesets do the same, or that a claim holds in every world.
+    """Prove that two rulesets are equivalent, or that a claim holds in every world.
 
-    A and B are RULES, or one pass of them, as in powderworld:flow. Elements, fields, parameters and streams match by
-    name. If A and B differ, a small world shows it. CLAIM is written as an invariant in a rule file.
+    A and B are RULES, or one pass of them, as in powderworld:flow. Elements, fields, parameters and streams are matched
+    by name. If A and B differ, a small world shows how. CLAIM has the syntax of an invariant.
 
     \b
         powderdsl prove mine.yaml == life
         powderdsl prove mine.yaml "mirrored worlds agree"
 
-    Exit code: 0 if it is proven, 1 if it is refuted or undecided, 2 for bad rules.
+    Exit code: 0 if proven, 1 if refuted or undecided, 2 for bad rules.
     """
     text = " ".join(words)
     sides = text.split(" == ") if "==" in words else re.findall(r"\S+", text.replace(" == ", " "))
@@ -53,7 +53,7 @@ def command(words: tuple[str, ...], prove: int, as_json: bool) -> int:
 
 
 def _compared(first: str, second: str, seconds: int) -> tuple[str, list[str], dict[str, Any]]:
-    """A status, lines of text, and the same as JSON."""
+    """A status, and the report as lines of text and as JSON."""
     from powderdsl.testing.properties.comparison import compare_rules
     from powderdsl.testing.properties.outcomes import world_lines
 
@@ -82,7 +82,7 @@ def _compared(first: str, second: str, seconds: int) -> tuple[str, list[str], di
 
 
 def _side(text: str) -> tuple[str, Ruleset]:
-    """The RULES that a side names, and their model, of one pass if it names one."""
+    """The RULES that a side names, and their model, limited to the pass if it names one."""
     rules, colon, word = text.rpartition(":")
     if not colon or Path(text).exists() or not re.fullmatch(r"[^\W\d]\w*", word):
         return text, load(text)

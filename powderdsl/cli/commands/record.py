@@ -27,26 +27,24 @@ if TYPE_CHECKING:
 @opt.option(
     "--policy",
     "expert|random|nothing|RUN",
-    "Policy: the task's expert, every action equally likely, no action, or a trained agent.",
+    "Policy: the task's expert, uniformly random actions, no action, or a trained agent.",
     "random",
 )
-@opt.option("--observation", ("ids", "compact"), "Record elements only, or the whole state.", "ids")
-@opt.option("--seed", (0, (1 << 61) - 1), "World of the first episode, and seed of the policy.", 0)
-@opt.option("--worlds", (1, (1 << 61) - 1), "How many worlds there are to draw from.", 1_000_000)
+@opt.option("--observation", ("ids", "compact"), "Record only elements, or the whole state.", "ids")
+@opt.option("--seed", (0, (1 << 61) - 1), "Number of the first episode's world, and seed of the policy.", 0)
+@opt.option("--worlds", (1, (1 << 61) - 1), "Number of worlds to draw from.", 1_000_000)
 @opt.task_options
 @opt.option("--shard", (1, 1 << 32), "Episodes per file.  [default: 256, or 256 MiB]")
 @opt.option("--compress", bool, "Smaller files, slower to read.")
 @opt.option("--envs", (1, 1 << 20), "Maximum number of episodes played at once.", 256)
 @opt.backend("auto")
 @opt.device
-@opt.path("--verify", "FOLDER", "Record nothing: read every byte of a dataset.")
-@opt.option(
-    "--to-minari", "ID", "Record nothing: write the dataset --out as a Minari dataset, namespace/name-v0."
-)
+@opt.path("--verify", "FOLDER", "Only verify a dataset, reading every byte.")
+@opt.option("--to-minari", "ID", "Only convert the dataset --out to a Minari dataset, namespace/name-v0.")
 @opt.option(
     "--from-minari",
     "ID",
-    "Record nothing: read a Minari dataset that --to-minari wrote into the folder --out.",
+    "Only convert a Minari dataset written by --to-minari to the folder --out.",
 )
 def command(
     task: str | None,
@@ -58,9 +56,9 @@ def command(
     from_minari: str | None,
     **how: Any,
 ) -> int:
-    """Record whole episodes of TASK: observations, actions, rewards, ends.
+    """Record episodes of TASK: observations, actions, rewards, and whether each step ends the episode.
 
-    The data depend only on the options, and not on --envs. After an interruption, the same command continues.
+    The data depend only on the options, but not on --envs. After an interruption, the same command resumes.
 
     \b
         powderdsl record TASK --out data --episodes 1000
@@ -109,7 +107,7 @@ NEEDS = {
     "--to-minari": ("--out",),
     "--from-minari": ("--out",),
 }
-"""The arguments that each of the command's modes needs; it takes no others of them."""
+"""The arguments that each mode of the command requires; it rejects those of other modes."""
 
 
 def _recorded(
@@ -136,7 +134,7 @@ def _recorded(
 
 
 def _trained(run: RunFolder, task: Task, how: dict[str, Any]) -> dict[str, Any]:
-    """The policy of a run, its name and what it observes, as arguments of `record`.
+    """The policy of a run, its name and its observation, as arguments of `record`.
 
     Raises CompileError (PD620), and ValueError if the run does not fit.
     """

@@ -14,19 +14,19 @@ from powderdsl.cli import options as opt
 @opt.world
 @opt.size
 @opt.output("--out", "FILE", "The .png file to write.", ".png", required=True)
-@opt.option("--scale", (1, 64), "Pixels per cell.  [default: about 400 a side]")
+@opt.option("--scale", (1, 64), "Pixels per cell.  [default: about 400 pixels per side]")
 def command(
     rules: str, world: str | None, out: Path, size: tuple[int, int] | None, scale: int | None
 ) -> None:
     """Draw a world as a picture, without running it.
 
-    The worlds of a saved batch stand side by side. Without --world, it is the one that `powderdsl run` starts from.
+    The worlds of a saved batch are drawn side by side. Without --world, draw the one that `powderdsl run` starts from.
     """
     ruleset = opt.load_rules(rules, {})
     from powderdsl.cli.pictures import pictures
     from powderdsl.cli.start_worlds import start
     from powderdsl.worlds.media import write_png
 
-    # Nothing runs, so the backend that takes no compiling will do.
+    # Nothing runs, so use the backend that needs no compiling.
     shown = start(ruleset, world, size, None, None, backend="reference")
     write_png(out, pictures(shown, most=len(shown), factor=scale))

@@ -1,4 +1,4 @@
-"""`powderdsl run`: run a world for some steps, and show or write the result."""
+"""`powderdsl run`: run a world, and show or write the result."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ class Playback:
 @opt.machine
 @opt.parameters
 @opt.output("--out", "FILE", "Write a .png, .gif or .mp4, or save the world as .npz.", *SUFFIXES)
-@opt.option("--scale", (1, 64), "Pixels per cell.  [default: about 400 a side]")
+@opt.option("--scale", (1, 64), "Pixels per cell.  [default: about 400 pixels per side]")
 @opt.option("--every", (1, 10**6), "Show every n-th step.", 1)
 @opt.option("--fps", (1, 240), "Frames per second.", 30)
 @opt.option("--watch", bool, "Show the first world in the terminal while it runs.")
@@ -69,10 +69,10 @@ def command(
     verbose: bool,
     **playback: Any,
 ) -> None:
-    """Run rules on a world: watch it, or write the result.
+    """Run a world: watch it, or write a picture or an animation.
 
-    Without --out and --watch the last step is drawn in the terminal. Without --world, shapes of all elements
-    are scattered at random: the same ones for the same --seed and --size.
+    Without --out and --watch, the last step is drawn in the terminal. Without --world, shapes of all elements are
+    placed at random, depending only on --seed and --size.
     """
     ruleset = opt.load_rules(rules, settings)
     plan = Playback(**playback)
@@ -107,7 +107,7 @@ def play(start: World, plan: Playback) -> World:
     from powderdsl.cli.pictures import LiveView, first_world, pictures
 
     ruleset, world = start.sim.ruleset, start
-    # Where nobody looks in between, short calls still let progress be shown and Ctrl-C be heard.
+    # Even if nothing is shown in between, short calls allow progress and Ctrl-C.
     looking = plan.watch or plan.suffix in ANIMATIONS
     stride = plan.every if looking else max(1, min(64, plan.steps // 50))
 

@@ -16,8 +16,8 @@ from powderdsl.system.writing import write_text
 def command(out: Path | None) -> None:
     """Print the JSON Schema of rule files, tasks, scenes and studies.
 
-    Editors with yaml-language-server complete keys with it, show what they mean, and underline wrong ones, in files with
-    the line `# yaml-language-server: $schema=powderdsl.schema.json`.
+    With it, editors that use yaml-language-server complete, explain and check keys in files with the line `#
+    yaml-language-server: $schema=powderdsl.schema.json`.
     """
     from powderdsl.editing.json_schema import schema
 

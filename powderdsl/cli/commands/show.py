@@ -1,4 +1,4 @@
-"""`powderdsl show`: what a ruleset or a task consists of, as tables or as JSON, and a picture of a task's worlds."""
+"""`powderdsl show`: the contents of a ruleset or task as tables or JSON, and pictures of a task's worlds."""
 
 from __future__ import annotations
 
@@ -28,12 +28,12 @@ if TYPE_CHECKING:
 
 @click.command("show")
 @click.argument("rules", metavar="RULES|TASK")
-@opt.option("--json", bool, "One JSON object instead of tables.", to="as_json")
-@opt.option("--cost", bool, "For a task: also which parts of a step do not run in one call of native code.")
+@opt.option("--json", bool, "Print one JSON object instead of tables.", to="as_json")
+@opt.option("--cost", bool, "For a task: also list parts of a step outside the single call of native code.")
 @opt.parameters
-@opt.knobs("For a task: another value for a knob.")
+@opt.knobs("For a task: set a knob.")
 @opt.option("--split", "SPLIT", "For a task: the set of worlds.", "train")
-@opt.option("--worlds", (1, 256), "For a task: how many worlds of the split.", 16)
+@opt.option("--worlds", (1, 256), "For a task: number of worlds of the split.", 16)
 @opt.output("--out", "FILE.png", "For a task: draw these worlds, with regions outlined.", ".png")
 def command(
     rules: str,
@@ -45,9 +45,9 @@ def command(
     worlds: int,
     out: Path | None,
 ) -> None:
-    """List elements, reactions, passes and parameters; or what a task is, with pictures.
+    """List elements, reactions, passes and parameters, or describe a task, with pictures.
 
-    TASK is a shipped task's name, or a file that begins with `task:`.
+    TASK is the name of a shipped task, or a file that begins with `task:`.
     """
     if is_task(rules):
         from powderdsl.tasks.shipped import check_split, load_task
@@ -66,11 +66,11 @@ def command(
 
 
 Tables = dict[str, list[dict[str, Any]]]
-"""Rows by column, by name of their table. A mapping in a row has a column for each of its keys."""
+"""The rows of each table, as values by column. A mapping in a row has a column for each key."""
 
 
 class Shown(NamedTuple):
-    """A cell that tables show as text, while JSON has its data."""
+    """A cell shown as text in tables, and as data in JSON."""
 
     text: str
     data: Any
@@ -81,11 +81,11 @@ TITLES = {
     "params": "Parameters (--set NAME=VALUE)",
     "knobs": "Knobs (--knob NAME=N)",
 }
-"""Titles of tables that say more than their names."""
+"""Titles of tables, where they differ from the name."""
 
 
 def _show(head: dict[str, Any], tables: Tables, as_json: bool) -> None:
-    """Print what something consists of; on a terminal with swatches of colors."""
+    """Print tables, with color swatches on a terminal."""
     if as_json:
         print_json(_data({**head, **tables}))
         return
@@ -184,7 +184,7 @@ def _of_rules(ruleset: Ruleset) -> tuple[dict[str, Any], Tables]:
 
 
 def _described(part: Any, *names: str) -> dict[str, Any]:
-    """Some attributes of a part of the model, and where it is written."""
+    """Some attributes of a part of the model, and its location."""
     special = {"kind": lambda: str(part.kind), "where": lambda: place_of(part.span)}
     return {name: special[name]() if name in special else getattr(part, name) for name in names}
 
@@ -201,13 +201,13 @@ def _elements(ruleset: Ruleset, ids: Iterable[int]) -> Shown:
 
 
 def _rules(pass_: Pass) -> Shown:
-    """The number of a pass's rules, and their lines, each once: loops and symmetries make many rules of one."""
+    """The number of a pass's rules, and their distinct lines: loops and symmetries make many rules of one."""
     spans = dict.fromkeys(rule.span for moment in pass_.moments for rule in moment.rules)
     return Shown(str(len(spans)), [{"rule": one_line(span), "where": place_of(span)} for span in spans])
 
 
 def _ramp(ramp: ColorRamp | None) -> Shown:
-    """The field that an element's color follows, and both ends."""
+    """The field that determines an element's color, and both ends of its range."""
     if ramp is None:
         return Shown("", None)
     data = {"field": ramp.field, "from": ramp.start, "to": ramp.end, "over": [ramp.lo, ramp.hi]}
@@ -215,7 +215,7 @@ def _ramp(ramp: ColorRamp | None) -> Shown:
 
 
 def _property(ruleset: Ruleset, prop: Property, element: Element) -> Shown:
-    """A property's value; text has a `*` where cells may hold one of their own."""
+    """A property's value; as text, with a `*` if cells may have their own value."""
     value = prop.values[element.id]
     text = show_value(ruleset, prop.kind, value)
     return Shown(f"{text}*" if element.id in prop.stored else text, _plain(value))
@@ -262,7 +262,7 @@ def _laws(split: Split) -> Shown:
 
 
 def _step_text(task: Task, split: str) -> str:
-    """What an environment's step runs, where there is a C++ compiler."""
+    """How an environment's step runs if there is a C++ compiler."""
     from powderdsl.tasks.episodes import compile_task
 
     meter = compile_task(task, split=split).meter
@@ -296,7 +296,7 @@ def _agent_text(task: Task) -> Iterator[str]:
 
 
 def _write_sheet(task: Task, split: str, worlds: int, out: Path) -> None:
-    """Start worlds side by side, each region outlined in a color of its own."""
+    """Start worlds side by side, each region outlined in its own color."""
     import torch
 
     from powderdsl.cli.pictures import MAX_SIDE

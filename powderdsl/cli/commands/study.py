@@ -1,4 +1,4 @@
-"""`powderdsl study`: many runs over a grid of settings and seeds, with one table and one figure at the end."""
+"""`powderdsl study`: run a grid of settings and seeds, and write a table and a figure."""
 
 from __future__ import annotations
 
@@ -58,15 +58,15 @@ if TYPE_CHECKING:
     from powderdsl.worldmodel.config import DataConfig
 
 JOBS = 2
-"""Processes at a time, unless the user says."""
+"""The default number of processes at a time."""
 MAX_SHARDS = 1_000_000
 
 CALLED = (("train",), ("evaluate",), ("wm", "train"), ("wm", "finetune"), ("wm", "eval"))
-"""Commands that steps of a study may call: those that write runs and evaluate them."""
+"""Commands that a study may call: those that write or evaluate runs."""
 
 NOT_FOR_STUDIES = ("DIR", "DATASET", "MODULE:CLASS", "--ignore-actions")
-"""Options that studies do not have, by their metavar or name: folders, which the study chooses, and modules, which would be
-imported, while a study may come from a stranger."""
+"""Options that studies cannot set, by metavar or name: folders, which the study chooses, and modules, which would be
+imported although a study may be untrusted."""
 
 
 def called(words: tuple[str, ...]) -> click.Command:
@@ -78,7 +78,7 @@ def called(words: tuple[str, ...]) -> click.Command:
 
 
 def commands() -> Mapping[tuple[str, ...], Mapping[str, str]]:
-    """The commands of `CALLED`, with the meaning of their options, of ``run``, and of their argument (``on``)."""
+    """The commands of `CALLED`, with their options, ``run``, and their argument (``on``)."""
     known: dict[tuple[str, ...], dict[str, str]] = {words: {} for words in CALLED}
     for words, meanings in known.items():
         for parameter in called(words).params:
@@ -99,7 +99,7 @@ only_option = opt.pairs(
     "Run only combinations with these values of a setting, or `seed=0,1`. May be repeated.",
     "only",
 )
-seeds_option = opt.option("--seeds", (1, 1000), "Runs of each combination.  [default: the study's]")
+seeds_option = opt.option("--seeds", (1, 1000), "Number of runs per combination.  [default: the study's]")
 
 
 def _shard(text: str) -> tuple[int, int]:
@@ -114,7 +114,7 @@ SHARD = opt.Parsed("I/N", _shard)
 
 
 def selected(study: Study, size: str, seeds: int | None, only: Mapping[str, str]) -> list[Point]:
-    """The combinations that were asked for. Raises BadInput if there are none."""
+    """The selected combinations. Raises BadInput if there are none."""
     points = every = list(islice(study.points(size, seeds), MAX_POINTS + 1))
     if len(every) > MAX_POINTS:
         raise BadInput(f"--seeds: a study has at most {MAX_POINTS:,} combinations")
@@ -133,13 +133,13 @@ def selected(study: Study, size: str, seeds: int | None, only: Mapping[str, str]
 
 
 def part(points: Sequence[Point], shard: tuple[int, int] | None) -> list[Point]:
-    """A shard of some points: consecutive ones, so that a shard has large and small settings."""
+    """A shard of some points: consecutive ones, which mixes large and small settings."""
     number, of = shard or (1, 1)
     return list(points[len(points) * (number - 1) // of : len(points) * number // of])
 
 
 class StudyCommand(click.Command):
-    """`study STUDY`, or `study collect FOLDER…`, which is a command of its own."""
+    """`study STUDY`, or the separate command `study collect FOLDER…`."""
 
     def make_context(
         self, info_name: str | None, args: list[str], parent: click.Context | None = None, **extra: Any
@@ -157,9 +157,9 @@ class StudyCommand(click.Command):
 @only_option
 @opt.path("--out", "FOLDER", "Folder for the table and the figure.  [default: the first FOLDER]")
 def collect(folders: tuple[Path, ...], seeds: int | None, only: dict[str, str], out: Path | None) -> int:
-    """Merge the results of a study that ran in several folders, or in parts.
+    """Merge the results of a study that ran in several folders or parts.
 
-    Writes results.md, results.json and figure.png, as the study does that ran in one piece. Exits with 1 if results of
+    Writes results.md, results.json and figure.png, as if the study had run in one folder. Exits with 1 if results of
     some combinations are missing.
     """
     runs = read_folders(folders, commands())
@@ -173,14 +173,14 @@ def collect(folders: tuple[Path, ...], seeds: int | None, only: dict[str, str], 
 
 @click.command("study", cls=StudyCommand)
 @click.argument("study", metavar="STUDY", required=False)
-@opt.option("--size", SIZES, "Size of the study: values of its settings.", "small")
+@opt.option("--size", SIZES, "Size of the study, which selects values of its settings.", "small")
 @seeds_option
-@opt.option("--jobs", (1, 256), "Processes that run at a time.  [default: 2; with --ray, as many as fit]")
+@opt.option("--jobs", (1, 256), "Number of processes at a time.  [default: 2; with --ray, as many as fit]")
 @opt.option("--threads", (1, 256), "Threads per process.", 1)
 @only_option
-@click.option("--shard", type=SHARD, help="Run only part I of N parts: for job arrays.")
+@click.option("--shard", type=SHARD, help="Run only part I of N, for job arrays.")
 @opt.option("--ray", "ADDRESS", "Run on a Ray cluster: `auto`, or HOST:PORT of its head.")
-@opt.path("--out", "FOLDER", "Folder of the results.  [default: studies/STUDY-SIZE]")
+@opt.path("--out", "FOLDER", "Folder for the results.  [default: studies/STUDY-SIZE]")
 @opt.option("--dry-run", bool, "Print the commands without running them.")
 def command(
     study: str | None,
@@ -194,11 +194,11 @@ def command(
     out: Path | None,
     dry_run: bool,
 ) -> int:
-    """Run a study: a file that names commands and the settings to vary, or a shipped one.
+    """Run a study: a shipped one, or a file that lists commands and the settings to vary.
 
-    Writes results.md, results.json and figure.png to its folder. The same call continues where it stopped, and adds to
-    what is there. Combinations that another process holds are left to it. Without STUDY, lists those that come with
-    powderdsl; `powderdsl study collect FOLDER…` merges results of several folders.
+    Writes results.md, results.json and figure.png to its folder. The same command resumes the study and adds to the
+    results. Combinations that another process is running are skipped. Without STUDY, list the shipped studies;
+    `powderdsl study collect FOLDER…` merges results of several folders.
     """
     known = commands()
     if study is None:
@@ -222,18 +222,19 @@ def command(
     run.prepare()
     outcomes = {
         outcome.point: (run.finished(outcome.point) if outcome.held else None)
-        or outcome  # it may be done by now
+        or outcome  # it may have finished
         for outcome in _with_progress(run, points, jobs, ray)
     }
     finished = [outcomes.get(point) or run.finished(point) for point in every]
     locked, missing = sum(outcome.held for outcome in outcomes.values()), finished.count(None)
     if locked:
         click.echo(
-            f"the study is not complete: other processes hold {counted(locked, 'combination')}", err=True
+            f"the study is not complete: other processes are running {counted(locked, 'combination')}",
+            err=True,
         )
     if missing:
         name = shlex.quote(str(folder))
-        click.echo(f"other parts have {counted(missing, 'combination')} that are not done in {name}")
+        click.echo(f"{counted(missing, 'combination')} of other parts are not done in {name}")
     if locked or missing:  # whoever finishes last writes the table, or `collect`
         return _status([*outcomes.values()])
     return _report(loaded, size, folder, [outcome for outcome in finished if outcome is not None])
@@ -284,20 +285,20 @@ def _status(outcomes: Sequence[Outcome]) -> int:
     return FAILED if any(outcome.problem for outcome in outcomes) else OK
 
 
-# The check before the first command runs: each command with every value of the study. Commands say why they refuse their
-# words, but not where the study has these: the word is to blame that a mistake names.
+# The check before the first command runs: each command with every value of the study. A command's error names the word
+# at fault, by which its location in the study is found.
 
 AGENT, NETWORK = "an agent", "a world model"
 MAKES = {("train",): AGENT, ("wm", "train"): NETWORK, ("wm", "finetune"): NETWORK}
-"""What the runs of commands train."""
+"""What each command trains."""
 WORKS_ON = {("evaluate",): AGENT, ("wm", "finetune"): NETWORK, ("wm", "eval"): NETWORK}
-"""What the runs that commands work on have trained."""
+"""What the run that each command works on must have trained."""
 
 
 def check_study(study: Study, reporter: Reporter, *, devices: bool = True) -> None:
-    """Report what a study's commands would refuse, and measures of runs that no step evaluates.
+    """Report what a study's commands would reject, and measures of runs that no step evaluates.
 
-    `devices`: whether it runs on this machine."""
+    `devices`: also check devices, as the study runs on this machine."""
     check = _StudyCheck(study, reporter, devices)
     points = [point for size in SIZES for point in study.points(size, 1)]
     for step, point in product(study.steps, points):
@@ -313,7 +314,7 @@ class _StudyCheck:
         self.study, self.reporter, self.devices = study, reporter, devices
         self.runs: dict[tuple[object, ...], Any] = {}
         self.refused: set[tuple[str, str, str]] = set()
-        """Words that are to blame for mistakes, by step and option."""
+        """Words at fault, by step and option."""
         self.wrong = {step.name for step in study.steps if step.is_wrong}
         """Steps with mistakes, whose consequences are not reported."""
         self.rules = cache(lambda rules, params: load(rules, params=dict(params)))
@@ -333,7 +334,7 @@ class _StudyCheck:
     def checked(self, step: StudyStep, point: Point, run: Any) -> Any:
         """The settings of a step's run; None after reporting all mistakes in its words.
 
-        Words with mistakes are left out, which shows what is wrong with others.
+        Words with mistakes are left out, to find mistakes in the others.
         """
         rest, reported = self.unrefused(step, point), set[str]()
         while rest.on == step.on:
@@ -352,7 +353,7 @@ class _StudyCheck:
         return None
 
     def unrefused(self, step: StudyStep, point: Point) -> StudyStep:
-        """A step without words that are to blame for mistakes."""
+        """A step without the words at fault."""
         words = [
             pair for pair in step.words if (step.name, pair[0], point.filled(pair[1])) not in self.refused
         ]
@@ -363,7 +364,7 @@ class _StudyCheck:
         try:
             return self.call(step, point, run), ()
         except CompileError as error:
-            # Where a value is out of range, mistakes in the file that uses it are consequences.
+            # If a value is out of range, mistakes in the file that uses it are consequences.
             own = [mistake for mistake in error.diagnostics if mistake.primary.span is None]
             if step.on is not None and own and own[0].code == "PD620":
                 steps = [
@@ -395,7 +396,7 @@ class _StudyCheck:
         self.reporter.add(replace(mistake, primary=Label(span or word.span), secondary=used))
 
     def call(self, step: StudyStep, point: Point, run: Any) -> Any:
-        """The settings of a step's run. Raises what its command would raise before it begins to work."""
+        """The settings of a step's run. Raises the errors of its command before it begins to work."""
         command, arguments = called(step.command), self.study.command(step, point, self.study.folder)
         several = {name[2:] for option in command.params if option.multiple for name in option.opts}
         names = set[str]()
@@ -418,7 +419,7 @@ class _StudyCheck:
         return self.settings(step.command, context.params, run)
 
     def settings(self, command: tuple[str, ...], values: Mapping[str, Any], run: Any) -> Any:
-        """The settings of the run that a command makes with these options; None for a command that evaluates `run`."""
+        """The settings of the run that a command with these options makes; None for a command that evaluates `run`."""
         match command:
             case ("train",):
                 config = train.new_config(values)
@@ -467,7 +468,7 @@ class _StudyCheck:
 
 
 def _check_evaluation(values: Mapping[str, Any], run: TrainConfig | None) -> None:
-    """Raise what `evaluate` raises before it plays. Of runs that the study does not make, only the path is checked."""
+    """Raise the errors of `evaluate` before it plays. For runs made outside the study, only the path is checked."""
     if run is None:
         task = opt.find_played(values["run"], values["knobs"], values["settings"], values["packs"])
         if not isinstance(task, Task):
@@ -482,7 +483,7 @@ def _check_evaluation(values: Mapping[str, Any], run: TrainConfig | None) -> Non
 
 
 def _task(name: str, knobs: Mapping[str, int], params: Mapping[str, Any], packs: Sequence[str]) -> Task:
-    """A task. Knobs within their ranges do not change what is checked, so that it is loaded once for all of them."""
+    """A task, loaded once for all values of its knobs within their ranges, as those do not affect the check."""
     more = str(Path(name).absolute()) if is_path(name) else name, tuple(params.items()), tuple(packs)
     task = _load_task((), *more)
     ranges = {knob.name: range(knob.lo, knob.hi + 1) for knob in task.knobs}
@@ -502,7 +503,7 @@ def _rules_of(task: str) -> str:
 
 
 def _blamed(mistake: Diagnostic, step: StudyStep, point: Point) -> tuple[str, Scalar | None]:
-    """The option and the word that a mistake names; no word where it names several options alike, or none."""
+    """The option and the word that a mistake names; no word if it names several options or none."""
     named = {*re.findall(r"(?:[`'(]|--|found )([\w.%:/-]+)", mistake.message)}
     variables = {name[2:]: option.name for option in called(step.command).params for name in option.opts}
     suspects: list[tuple[int, str, Scalar]] = []

@@ -1,4 +1,4 @@
-"""`powderdsl test`: run the tests of packs, check their invariants, and list rules that never happened."""
+"""`powderdsl test`: run the tests of packs, check their invariants, and list rules that never fired."""
 
 from __future__ import annotations
 
@@ -47,24 +47,24 @@ MAX_SECONDS = 24 * 3600
 @click.argument("rules", nargs=-1, metavar="[RULES]...")
 @opt.backend(None, "Backend that runs the rules.  [default: wasm]")
 @opt.parameters
-@opt.option("--examples", (0, 10_000_000), "Random worlds on which each invariant is tried.", 1000)
+@opt.option("--examples", (0, 10_000_000), "Number of random worlds on which to try each invariant.", 1000)
 @opt.option("--seconds", (1, MAX_SECONDS), "Time limit for random worlds, per RULES, in seconds.", 60)
 @opt.option("--seed", (0, 2**31 - 1), "Seed of the random worlds.", 0)
 @opt.proof
-@opt.path("--replay", "FILE", "Only try this counterexample again.")
-@opt.output("--picture", "FILE", "Draw the first counterexample, before and after, as a .png.", ".png")
+@opt.path("--replay", "FILE", "Only replay this counterexample.")
+@opt.output("--picture", "FILE", "Draw the first counterexample, before and after, to a .png file.", ".png")
 @click.option(
     "--keep/--no-keep",
     default=None,
     help="Keep counterexamples in .powderdsl/.  [default: unless $CI is set]",
 )
-@opt.option("--json", bool, "One JSON object instead of text.", to="as_json")
-@opt.option("--mutate", bool, "Put mistakes into the packs, and list those that nothing notices.")
-@opt.pack_list("--packs", "With --mutate: only mistakes in these packs.")
+@opt.option("--json", bool, "Print one JSON object instead of text.", to="as_json")
+@opt.option("--mutate", bool, "Insert mistakes into the packs and list those that no test detects.")
+@opt.pack_list("--packs", "With --mutate: mutate only these packs.")
 @opt.option(
-    "--mutants", (1, 1_000_000), "With --mutate: maximum number of mutants, of each kind in proportion."
+    "--mutants", (1, 1_000_000), "With --mutate: maximum number of mutants, in proportion for each kind."
 )
-@opt.option("--write", bool, "With --mutate: add tests that notice them to their packs.")
+@opt.option("--write", bool, "With --mutate: add tests that detect them to the packs.")
 @opt.option("--jobs", (1, 256), "With --mutate: number of processes.  [default: one per processor]")
 def command(
     rules: tuple[str, ...],
@@ -83,11 +83,11 @@ def command(
 ) -> int:
     """Run the tests of packs and check their invariants.
 
-    Without RULES, all that come with powderdsl. A test without a seed runs with five. Invariants are proven where that
-    is possible, else tried on random worlds; one that breaks is shown by a small world, kept in .powderdsl/, and tried
-    first from then on.
+    Without RULES, test all shipped rules. A test without a seed runs with five seeds. Invariants are proven if
+    possible, and otherwise tried on random worlds. A small world that breaks one is printed, stored in .powderdsl/, and
+    tried first in later runs.
 
-    Exit code: 0 if all holds, 1 if something fails, 2 for bad rules.
+    Exit code: 0 if everything passes, 1 if something fails, 2 for bad rules.
     """
     for name, value in ({"replay": replay, "picture": picture} if mutate else mutation).items():
         if value:
@@ -97,7 +97,7 @@ def command(
     if replay is not None and len(rules) != 1:
         raise BadInput("--replay takes the one RULES that the counterexample breaks")
     if keep is None:
-        keep = not os.environ.get("CI")  # a machine that runs tests and is thrown away
+        keep = not os.environ.get("CI")  # a disposable CI machine
     session = _Report(backend, SearchPlan(examples, float(seconds), seed, prove), keep, picture, as_json)
     for name in rules or shipped_tests():
         ruleset = opt.load_rules(name, settings)
@@ -115,10 +115,10 @@ def command(
 
 @dataclass
 class _Report:
-    """One call of the command: its options, and its results so far.
+    """One call of the command: its options and its results so far.
 
-    `keep`: whether counterexamples are kept. `picture`: where the first one is drawn. `own`: the files that RULES name, if
-    each part names one or some are paths, else all; what others contain is shown only where it is wrong.
+    `keep`: store counterexamples. `picture`: where to draw the first one. `own`: the files that RULES name, if each
+    part names one or some are paths, else all; of other files, only failures are shown.
     """
 
     backend: str | None
@@ -156,11 +156,11 @@ class _Report:
         lines = [span for span in runner.lines if span.source.name in self.own]
         missed = [span for span in lines if span not in runner.happened]
         for span in missed:
-            self.say(f"never happened: {place_of(span)}: {one_line(span)}")
+            self.say(f"never fired: {place_of(span)}: {one_line(span)}")
         title = ruleset.name if self.own == files else ", ".join(sorted(self.own))
         self.say(
-            f"{title}: {len(lines) - len(missed)} of {counted(len(lines), 'rule')} happened"
-            f" on {runner.worlds_run:,} worlds in {monotonic() - start:.0f} s"
+            f"{title}: {len(lines) - len(missed)} of {counted(len(lines), 'rule')} fired"
+            f" in {runner.worlds_run:,} worlds in {monotonic() - start:.0f} s"
         )
         declared = [result for result in results if result.prop.owner != "automatic"]
         totals = [counted(len(tests), "test")]
@@ -212,7 +212,7 @@ class _Report:
                 self.picture = None
 
     def replay(self, name: str, ruleset: Ruleset, path: Path) -> None:
-        """Try one counterexample again, unmodified."""
+        """Replay one counterexample unmodified."""
         text, sample, steps = read_example(path, ruleset)
         runner = Runner(ruleset, self.backend)
         search = InvariantSearch.of(runner, self.plan)
@@ -268,8 +268,8 @@ def _failure_lines(result: ExampleResult) -> Iterator[str]:
 
 
 def _mutate(names: Iterable[str], as_json: bool, **how: Any) -> int:
-    """Mutate each of some compositions; the exit code: 1 if a mutant survives."""
-    os.environ.setdefault("OMP_NUM_THREADS", "1")  # one thread a process; they inherit it
+    """Mutate each of some compositions; return exit code 1 if a mutant survives."""
+    os.environ.setdefault("OMP_NUM_THREADS", "1")  # one thread per process; they inherit it
     data = {}
     try:
         for name in names:
@@ -290,7 +290,7 @@ def _mutated(
     jobs: int | None,
     write: bool,
 ) -> dict[str, Any]:
-    """Mutate some packs of a composition alone, up to `mutants`, in `jobs` processes; `write` adds tests to their files."""
+    """Mutate some packs of a composition, up to `mutants`, in `jobs` processes; `write` adds tests to their files."""
     from powderdsl.testing.mutation.judging import Original, run_campaign, sampled, tally
 
     began = monotonic()
@@ -346,7 +346,7 @@ def _collect(
 
 
 def _survivors(judged: Sequence[tuple[Mutant, Verdict]]) -> Iterator[str]:
-    """Each mutant that nothing noticed, with a test that would."""
+    """Each mutant that no test detected, with a test that would."""
     for mutant, verdict in judged:
         if verdict.status == "survived":
             yield f"survived  {mutant.place}: {mutant.operator}"
@@ -369,7 +369,7 @@ def _row(mutant: Mutant, verdict: Verdict) -> dict[str, Any]:
 
 
 def summary(verdicts: Sequence[Verdict]) -> str:
-    """The number of mutants, and what noticed them."""
+    """The number of mutants, and what detected them."""
     from powderdsl.testing.mutation.judging import noticed_share, tally
 
     counts = tally(verdicts)
@@ -389,7 +389,7 @@ def _write(judged: Sequence[tuple[Mutant, Verdict]]) -> None:
     tests: dict[Path, dict[str, GeneratedTest]] = {}
     for mutant, verdict in judged:
         if verdict.test is not None:
-            body = verdict.test.text.split("\n", 1)[1]  # several mutants may be told apart by one world
+            body = verdict.test.text.split("\n", 1)[1]  # one world may detect several mutants
             tests.setdefault(Path(mutant.source.name), {}).setdefault(body, verdict.test)
     for path, some in tests.items():
         try:

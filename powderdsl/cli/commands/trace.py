@@ -1,4 +1,4 @@
-"""`powderdsl trace`: why a cell holds what it holds after a step."""
+"""`powderdsl trace`: explain the contents of a cell after a step."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ CELL = opt.Parsed("ROW,COLUMN", _cell)
 @opt.option("--step", (1, 10**9), "Step of the run, from 1.", required=True)
 @opt.option("--of", opt.NAMES, "Explain only `element`, or these fields.")
 @opt.option("--number", (0, 1 << 20), "Number of the world in a saved batch.", 0)
-@opt.option("--all", bool, "List every rule that did not happen, and why.", to="every_rule")
+@opt.option("--all", bool, "List every rule that did not fire, and why.", to="every_rule")
 @opt.option("--json", bool, "Print one JSON object.", to="as_json")
 @opt.backend("auto", "Backend that runs the steps before it.")
 @opt.parameters
@@ -50,9 +50,9 @@ def command(
     settings: dict[str, str],
     **how: Any,
 ) -> None:
-    """Explain why a cell holds what it holds after a step.
+    """Explain the contents of a cell after a step.
 
-    Which rules wrote it in that step, what they read, and which rules nearly wrote it. Worlds are those of
+    Prints which rules wrote it in that step, what they read, and which rules nearly wrote it. The world is that of
     `powderdsl run` with the same --world, --size and --seed.
     """
     ruleset = opt.load_rules(rules, settings)

@@ -1,4 +1,4 @@
-"""`powderdsl train`: an agent learns a task; `powderdsl evaluate` and `powderdsl watch` show what it has learned."""
+"""`powderdsl train`: train an agent on a task; `powderdsl evaluate` and `powderdsl watch` show the result."""
 
 from __future__ import annotations
 
@@ -18,24 +18,24 @@ from powderdsl.system.reading import read_json
 @click.command("train", cls=opt.Command)
 @click.argument("task", metavar="TASK", required=False)
 @opt.path("--run", "DIR", "Folder of the run.  [default: runs/TASK-seedN]", to="folder")
-@opt.path("--resume", "DIR", "Continue a run with its own settings.")
+@opt.path("--resume", "DIR", "Resume a run with its own settings.")
 @opt.option(
     "--preset",
     list(PRESETS),
-    "Settings that other options change: the paper's, or those for a few minutes on one core."
+    "Base settings, which other options override: the paper's, or a few minutes on one core."
     "  [default: small; paper with --device cuda]",
     to="preset_name",
 )
-@opt.path("--init-from", "DATASET", "Dataset whose actions the network learns first (behavior cloning).")
+@opt.path("--init-from", "DATASET", "Dataset whose actions the network imitates first (behavior cloning).")
 @opt.settings_of(TrainConfig, PRESETS, checkpoint_minutes="save-every")
 @opt.task_options
 @opt.backend(None, "Backend that runs the rules.  [default: auto]")
-@opt.option("--json", bool, "One JSON object instead of text.", to="as_json")
+@opt.option("--json", bool, "Print one JSON object instead of text.", to="as_json")
 def command(task: str | None, folder: Path | None, resume: Path | None, as_json: bool, **values: Any) -> None:
-    """Train an agent on TASK with PPO: a shipped task's name, or a task's file.
+    """Train an agent with PPO on TASK, a shipped task's name or a task file.
 
-    The same command again, or --resume DIR, continues where a run was interrupted; more --steps continue with one that is
-    done. DIR gets checkpoints, metrics.jsonl and events for TensorBoard.
+    The same command, or --resume DIR, resumes an interrupted run; a larger --steps extends a finished one. DIR contains
+    checkpoints, metrics.jsonl and events for TensorBoard.
     """
     if resume is not None:
         if task is not None or folder is not None:
@@ -64,11 +64,11 @@ def command(task: str | None, folder: Path | None, resume: Path | None, as_json:
 
 
 WHAT = ("knobs", "settings", "packs")
-"""Options that decide on worlds and rules."""
+"""Options that determine worlds and rules."""
 
 
 def new_config(values: Mapping[str, Any]) -> TrainConfig:
-    """The settings of a new run, of options. Raises CompileError and BadInput with what is wrong in them."""
+    """The settings of a new run, from options. Raises CompileError and BadInput for invalid ones."""
     task = values["task"]
     if task is None:
         raise BadInput("say which TASK, or --resume DIR")
@@ -82,7 +82,7 @@ def new_config(values: Mapping[str, Any]) -> TrainConfig:
 
 
 def _continued(folder: Path, values: Mapping[str, Any]) -> tuple[TrainConfig, Path]:
-    """The settings of a run, with those changed that may change, and its folder."""
+    """The settings of a run, with permitted changes, and its folder."""
     from powderdsl.experiments.runs import find_run
     from powderdsl.rl.config import HOW
     from powderdsl.rl.policies import config_of

@@ -1,4 +1,4 @@
-"""`powderdsl universe`: the rule pack of a seed, and what is known about it."""
+"""`powderdsl universe`: print and check the rule pack generated from a seed."""
 
 from __future__ import annotations
 
@@ -16,20 +16,20 @@ from powderdsl.universes import MAX_SEED, universe_text
 @click.command("universe")
 @click.argument("seed", type=opt.Integer(0, MAX_SEED))
 @opt.output("--out", "FILE", "The .yaml file to write instead of printing the pack.", ".yaml")
-@opt.option("--about", bool, "Print the laws in words instead, one per line.")
-@opt.option("--quick", bool, "Print the pack only: do not check it, and run no world.")
+@opt.option("--about", bool, "Print the laws in words instead of YAML, one per line.")
+@opt.option("--quick", bool, "Only print the pack, without checking or running it.")
 def command(seed: int, out: Path | None, about: bool, quick: bool) -> int:
-    """Print the rule pack of a seed: invented elements under laws that nobody has seen.
+    """Print the rule pack generated from a seed: invented elements under new laws.
 
-    The same seed gives the same pack, and `universe:SEED` names it wherever RULES are named. What checking it and running
-    it for some steps show goes to stderr.
+    The same seed gives the same pack; `universe:SEED` is a valid RULES in every command. A report of checking and
+    running it for some steps goes to stderr.
 
     \b
         powderdsl universe 7 --about
         powderdsl run universe:7 --watch
 
-    Exit code: 0, or 1 if the pack does not pass: it has remarks, claims that are not proven, or worlds in which nothing
-    moves, nothing reacts or one element takes over.
+    Exit code: 0, or 1 if the pack fails: it has diagnostics, unproven claims, or worlds in which nothing moves, nothing
+    reacts or one element takes over.
     """
     text = universe_text(seed)
     if out is not None:

@@ -1,4 +1,4 @@
-"""`powderdsl watch`: a film of an agent at its task."""
+"""`powderdsl watch`: record a video of an agent at its task."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ from powderdsl.tasks.task import Task
 
 @click.command("watch", cls=opt.Command)
 @click.argument("run", metavar="RUN|TASK")
-@click.option("--split", help="Split: the set of worlds.  [default: test where the task has it, else train]")
-@opt.option("--worlds", (1, 64), "How many worlds of the split, side by side.", 4)
+@click.option("--split", help="Split: the set of worlds.  [default: test if the task has it, else train]")
+@opt.option("--worlds", (1, 64), "Number of worlds of the split, side by side.", 4)
 @opt.option(
     "--policy",
     ("trained", "expert", "random", "nothing"),
     "Policy that acts.  [default: trained; for a TASK: random]",
 )
-@click.option("--deterministic/--sampled", default=False, help="Take the likeliest action, or draw one.")
-@opt.option("--seed", (0, 2**32 - 1), "Seed of what the policy draws.", 0)
+@click.option("--deterministic/--sampled", default=False, help="Take the most likely action, or sample one.")
+@opt.option("--seed", (0, 2**32 - 1), "Seed of the policy.", 0)
 @opt.task_options
-@opt.output("--out", "FILE", "The film to write.  [default: watch.gif in the run's folder]", ".gif", ".mp4")
+@opt.output("--out", "FILE", "Video file to write.  [default: watch.gif in the run's folder]", ".gif", ".mp4")
 @opt.option("--fps", (1, 240), "Frames per second.", 15)
 @opt.option("--scale", (1, 32), "Pixels per cell.", 4)
 @click.option("--backend", type=opt.BACKEND, help="Backend that runs the rules.  [default: the run's]")
@@ -42,10 +42,10 @@ def command(
     backend: str | None,
     **changes: Any,
 ) -> None:
-    """Play worlds of a RUN's task with its agent, side by side, and write the film.
+    """Play worlds of a RUN's task with its agent, side by side, and write a video.
 
-    Regions are outlined, and so is where the agent acts; below each world stand its return so far and the action. For a
-    TASK, actions are random, or nobody acts.
+    Regions and the agent's brush are outlined; the return so far and the action are shown below each world. For a TASK,
+    actions are random, or there is no agent.
     """
     played = opt.find_played(run, **changes)
     policy = policy or ("random" if isinstance(played, Task) else "trained")
@@ -60,7 +60,7 @@ def command(
         out = own.path / "watch.gif" if own else Path("watch.gif")
         opt.check_writable(out)
     if max(task.size) * scale * min(worlds, 4) > MAX_SIDE:
-        raise BadInput("such a picture is too large: choose a smaller --scale, or fewer --worlds")
+        raise BadInput("the video would be too large: choose a smaller --scale, or fewer --worlds")
     import torch
 
     from powderdsl.tasks.episodes import compile_task

@@ -1,4 +1,4 @@
-"""`powderdsl wm`: train networks that predict worlds, test them, and teach them packs they have not seen."""
+"""`powderdsl wm`: train and test networks that predict worlds, and fine-tune them on new packs."""
 
 from __future__ import annotations
 
@@ -35,16 +35,16 @@ _machine_options = opt.several(
     opt.option(
         "--network",
         "MODULE:CLASS",
-        "Your network, which is imported.  [default: the U-net]",
+        "Your own network, which is imported.  [default: the U-net]",
         to="network_name",
     ),
     opt.machine,
 )
 _test_options = opt.several(
     click.argument("run", metavar="RUN"),
-    opt.option("--task", "TASK", "A shipped task or a file.  [default: the run's]"),
+    opt.option("--task", "TASK", "A shipped task or a task file.  [default: the run's]"),
     opt.option(
-        "--split", "SPLIT", "Split of the task to test on.  [default: designed, or that of the training]"
+        "--split", "SPLIT", "Split of the task to test on.  [default: designed, or the one used in training]"
     ),
     opt.option("--rules", "RULES", "Rules to test under.  [default: the run's]"),
     _recording,
@@ -55,7 +55,7 @@ _run_options = opt.several(
     opt.path(
         "--run", "DIR", "Folder of the run.  [default: named after TASK, or RUN and packs]", to="folder"
     ),
-    opt.option("--store", ["auto", "memory", "disk"], "Where to keep the buffer.", "auto"),
+    opt.option("--store", ["auto", "memory", "disk"], "Storage of the buffer.", "auto"),
     opt.option(
         "--save-every", click.FloatRange(0, 1e6), "Minutes between checkpoints.", 1.0, metavar="MINUTES"
     ),
@@ -65,7 +65,7 @@ _run_options = opt.several(
 
 @click.group("wm")
 def command() -> None:
-    """World models: networks that predict what a world holds some steps later.
+    """World models: networks that predict a world some steps ahead.
 
     \b
         powderdsl wm train --held-out PACK --run runs/less
@@ -78,25 +78,25 @@ def command() -> None:
 @opt.option(
     "--preset",
     ["small", "paper"],
-    "Settings that other options change: `small` for a CPU, `paper` for a GPU.",
+    "Base settings, which other options override: `small` for a CPU, `paper` for a GPU.",
     "small",
 )
 @click.argument("task", metavar="TASK", required=False)
 @_recording
-@opt.option("--ignore-actions", bool, "With --data: the network does not see the actions.")
+@opt.option("--ignore-actions", bool, "With --data: hide the actions from the network.")
 @opt.settings_of(DataConfig, {name: vars(preset.data) for name, preset in PRESETS.items()})
 @opt.settings_of(TrainConfig, {name: vars(preset) for name, preset in PRESETS.items()})
 @opt.option("--rules", "RULES", "Rules of the worlds.  [default: the task's own]")
-@opt.pack_list("--packs", "Keep only these packs of the rules, or add them.")
-@opt.pack_list("--held-out", "Leave these packs of the rules out.")
-@opt.knobs("Another value for a knob of the task.")
+@opt.pack_list("--packs", "Use only these packs of the rules, or add them.")
+@opt.pack_list("--held-out", "Exclude these packs of the rules.")
+@opt.knobs("Set a knob of the task.")
 @opt.parameters
 @_run_options
 def train_command(folder: Path | None, ignore_actions: bool, **values: Any) -> None:
-    """Train a network on worlds of TASK that nobody touches.
+    """Train a world model on worlds without agent actions.
 
-    TASK is a shipped one, by default world-model, or a file.
-    A run that was stopped continues when the same command is given again, as if it had not been stopped.
+    TASK is a shipped task (default: world-model) or a file. Repeat the same command to resume a stopped run; the result
+    is the same as without the stop.
     """
     if values["network_name"] and values["width"]:
         raise BadInput("--width is that of the U-net: leave it out with --network")
@@ -119,9 +119,9 @@ def train_command(folder: Path | None, ignore_actions: bool, **values: Any) -> N
 
 
 def new_config(values: Mapping[str, Any], rules_of: Callable[..., str]) -> TrainConfig:
-    """The settings of a new run on worlds. Raises CompileError and BadInput with what is wrong in them.
+    """The settings of a new run on worlds. Raises CompileError and BadInput for invalid ones.
 
-    `values`: of the options. `rules_of`: the function of this name, or one that remembers its results.
+    `values`: the options' values. `rules_of`: the function of this name, or a cached version.
     """
     packs, held_out = values["packs"], values["held_out"]
     if packs and held_out:
@@ -142,7 +142,7 @@ def new_config(values: Mapping[str, Any], rules_of: Callable[..., str]) -> Train
 @click.argument("run", metavar="RUN")
 @opt.pack_list(
     "--packs",
-    "The packs to learn, by name or file: added to the run's rules, and all that worlds draw.",
+    "Packs to learn, by name or file: they are added to the run's rules, and worlds draw nothing else.",
     required=True,
 )
 @opt.settings_of(TrainConfig, only=("iterations", "batch", "learning_rate", "seed"))
@@ -167,19 +167,17 @@ def finetune_command(run: str, packs: tuple[str, ...], folder: Path | None, **va
 @command.command("eval", cls=opt.Command)
 @_test_options
 @opt.pack_list("--only", "Draw elements of these packs only.  [default: the run's]")
-@opt.knobs("Another value for a knob of the task.  [default: the run's]")
-@opt.option(
-    "--worlds", (1, 1 << 20), "Worlds of the split, or futures of each designed world.  [default: 32, 4]"
-)
+@opt.knobs("Set a knob of the task.  [default: the run's]")
+@opt.option("--worlds", (1, 1 << 20), "Worlds of the split, or futures per designed world.  [default: 32, 4]")
 @opt.option("--steps", (1, 4096), "Steps to predict.  [default: as trained]")
-@opt.option("--json", bool, "One JSON object instead of a table.", to="as_json")
+@opt.option("--json", bool, "Print one JSON object instead of a table.", to="as_json")
 def eval_command(run: str, as_json: bool, **values: Any) -> None:
-    """Test a network beside two baselines.
+    """Compare a network with two baselines.
 
-    They say that nothing changes, or each element's most frequent outcome.
-    RUN is a run's folder, or its name in runs/. Losses are cross-entropies a cell, in nats. The worlds have seeds
-    that no training takes. A network that learned from a dataset is tested on its test worlds, or on another dataset,
-    and also with its actions hidden. What is found is also written to the run's evaluation.json.
+    They predict no change, or each element's most frequent outcome. RUN is a run's folder, or its name in runs/. Losses
+    are cross-entropies per cell, in nats. The worlds have seeds that training never uses. A network trained on a
+    dataset is tested on its test worlds or on another dataset, with and without actions. Results are also written to
+    the run's evaluation.json.
     """
     from powderdsl.experiments.runs import write_json
     from powderdsl.worldmodel.evaluation import evaluate, evaluate_recording
@@ -202,7 +200,7 @@ def eval_command(run: str, as_json: bool, **values: Any) -> None:
 
 
 def _times(trained: Trained, steps: int | None) -> int:
-    """How often a network is applied to predict some steps."""
+    """The number of times to apply a network to predict some steps."""
     times, rest = divmod(steps or trained.config.data.steps, trained.config.data.steps)
     if rest:
         step = trained.config.data.steps
@@ -214,12 +212,12 @@ def _times(trained: Trained, steps: int | None) -> int:
 @_test_options
 @opt.output("--out", "FILE", "The picture to write.", ".png", required=True)
 @opt.option("--steps", (1, 4096), "Steps to predict.  [default: as trained]")
-@opt.option("--after", (0, 10**6), "Steps that worlds run before the start.  [default: 0]")
+@opt.option("--after", (0, 10**6), "Steps that worlds run before the prediction starts.  [default: 0]")
 @opt.option("--scale", (1, 16), "Pixels per cell.", 4)
 def show_command(run: str, out: Path, scale: int, **values: Any) -> None:
     """Draw each test as a strip: start, truth, prediction, mistakes.
 
-    For several times the steps that the network was trained for, it is applied to what it predicted.
+    For multiples of the trained number of steps, the network is applied to its own prediction.
     """
     from powderdsl.worldmodel.evaluation import recorded_strips, strips, unseen_worlds
 
@@ -236,7 +234,7 @@ def show_command(run: str, out: Path, scale: int, **values: Any) -> None:
 
 
 def _show(strips: list[Strip], rules: Ruleset, out: Path, scale: int) -> None:
-    """Draw strips, and count what is wrong in each."""
+    """Draw strips, and count the wrong cells in each."""
     from powderdsl.worldmodel.evaluation import sheet
     from powderdsl.worlds.media import write_png
 
@@ -246,7 +244,7 @@ def _show(strips: list[Strip], rules: Ruleset, out: Path, scale: int) -> None:
 
 
 def tested_on(values: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the options that choose the worlds of a test."""
+    """Return the options that select the worlds of a test."""
     return opt.given_options(values, ("task", "split", "rules", "only", "knobs"))
 
 
@@ -263,14 +261,14 @@ def _machine(values: dict[str, Any]) -> Machine:
 
 
 def _refuse_world_options(values: Mapping[str, Any]) -> None:
-    """Refuse options that select worlds: a dataset has its own."""
+    """Reject options that select worlds, since a dataset has its own."""
     for option in click.get_current_context().command.params:
         if option.name in opt.given_options(values, OF_WORLDS):
             raise BadInput(f"{option.opts[0]} selects worlds, and --data has its own")
 
 
 def _load_network(run: str, values: dict[str, Any]) -> tuple[Trained, Recording | None, Machine]:
-    """The network of a run, the recording that it is tested on if it has actions, and where to compute."""
+    """The network of a run, its test recording if it has actions, and the device."""
     from powderdsl.worldmodel.training import load_trained
     from powderdsl.worldmodel.worlds import open_recording
 
@@ -298,7 +296,7 @@ def _import_network(name: str | None) -> CustomNetwork | None:
 
 
 def rules_of(rules: str, task: str, packs: tuple[str, ...], held_out: tuple[str, ...]) -> str:
-    """Rules, or those of a task, with some packs alone or without others."""
+    """Rules, or those of a task, limited to some packs or without others."""
     from powderdsl.tasks.shipped import load_task
     from powderdsl.worldmodel.training import keep, leave_out
 

@@ -1,8 +1,8 @@
-"""Effects of added packs on packs whose authors did not know them: values, conflicts, claims and warnings.
+"""Effects of added packs on unrelated packs: values, conflicts, claims and warnings.
 
-The packs that an author knew are a scope, see `Composition.scope`. Packs outside it were added. A conflict, a claim
-(an invariant or a test) or a warning is judged by its scope alone; if only added packs cause it, it is reported at the
-line of the added pack.
+The packs that an author took into account are a scope, see `Composition.scope`; all others were added. A conflict, a
+claim (an invariant or a test) or a warning is judged within its scope; if only added packs cause it, it is reported at
+the line of the added pack.
 """
 
 from __future__ import annotations
@@ -21,12 +21,12 @@ from powderdsl.syntax.parse import Syntax
 CODES = ("PD501", "PD502")
 
 CheckAlone = Callable[[tuple[str, ...], Reporter], object]
-"""Checks some of the packs alone; None if something is wrong with them."""
+"""Checks some of the packs alone; None if there are errors."""
 
 
 @dataclass(frozen=True)
 class Cause:
-    """A place in the file of an added pack: a rule with its text, or its effect on other packs in a few words."""
+    """A location in the file of an added pack: a rule with its text, or its effect on other packs in a few words."""
 
     pack: str
     span: Span
@@ -36,9 +36,9 @@ class Cause:
 
 @dataclass(frozen=True)
 class Difference:
-    """The reason why a claim or a warning changes with more packs than those of its scope.
+    """The reason that packs outside a scope change a claim or a warning.
 
-    `packs` are the added packs that matter, in load order; `causes` are the places in their files, as far as known.
+    `packs` are the relevant added packs, in load order; `causes` are the known locations in their files.
     """
 
     packs: tuple[str, ...]
@@ -66,7 +66,7 @@ def pack_words(pack: PackDecl) -> Iterator[str]:
 
 
 GivenValue = tuple[str, Span, Syntax | ColorRamp]
-"""A value that a pack gives an element: the pack, the place, the value."""
+"""A value that a pack sets for an element: the pack, the location, the value."""
 
 
 def report_replaced(
@@ -77,7 +77,7 @@ def report_replaced(
     composition: Composition,
     reporter: Reporter,
 ) -> None:
-    """Report that a pack replaces a value of another pack: a note if it needs that pack, else a warning.
+    """Report that a pack replaces a value set by another pack: a note if it needs that pack, else a warning.
 
     Values of a ruleset replace values of its packs without a report; a pack that is added to it may replace them.
     """
@@ -89,18 +89,18 @@ def report_replaced(
     if before not in needs or before in needs[after]:
         reporter.report(
             "PD317", f"`{after}` replaces the `{what}` of `{element}`", new, "this value is used",
-            secondary=[Label(old, f"the one that `{before}` gives")],
+            secondary=[Label(old, f"the one that `{before}` sets")],
         )  # fmt: skip
         return
     reporter.report(
-        "PD316", f"packs `{before}` and `{after}` give `{element}` a different `{what}`", new, "this value is used",
+        "PD316", f"packs `{before}` and `{after}` set a different `{what}` for `{element}`", new, "this value is used",
         secondary=[Label(old, "this one is lost")],
-        helps=[f"say `needs: {before}` in `{after}` if it means to replace it", "or remove one of them"],
+        helps=[f"write `needs: {before}` in `{after}` if it is meant to replace it", "or remove one of them"],
     )  # fmt: skip
 
 
 def _meaning(value: Syntax | ColorRamp) -> object:
-    """The number that a value is, or the words of any other value."""
+    """A value as a number, or as words if it is not a number."""
     if isinstance(value, ColorRamp):
         return value
     text = " ".join(value.span.text.split())
@@ -110,13 +110,13 @@ def _meaning(value: Syntax | ColorRamp) -> object:
         return text
 
 
-# Conflicts: users who add packs cannot change the rules that meet. So the first rule wins, as with
+# Conflicts: users who add packs cannot change the conflicting rules. So the first rule wins, as with
 # `conflicts: first_wins`, where that changes nothing for the packs that the author of the rules knew.
 
 
 @dataclass
 class AddedPacks:
-    """Finds conflicts that a pack has only because other packs were added to it."""
+    """Finds conflicts that a pack has only because other packs were added."""
 
     composition: Composition
     check_alone: CheckAlone
@@ -125,7 +125,7 @@ class AddedPacks:
     def causes(self, pack: str, place: Span, ids: Sequence[int]) -> tuple[Cause, ...]:
         """The places in added packs that cause a conflict in `pack`; empty if it has the conflict without them.
 
-        `place`: the span at which the conflict is reported. `ids`: elements with which the rules meet.
+        `place`: the span at which the conflict is reported. `ids`: elements for which the rules conflict.
         """
         packs = self.composition.packs
         words = frozenset(pack_words(packs[pack]))
@@ -142,7 +142,7 @@ class AddedPacks:
         return tuple(cause for name in elements for cause in self._additions(name, scope, words))
 
     def _conflicts_alone(self, scope: tuple[str, ...]) -> frozenset[Span] | None:
-        """The spans at which rules of some packs alone conflict; None if they have other errors."""
+        """The spans of conflicts of some packs alone; None if they have other errors."""
         reporter = Reporter()
         self.check_alone(scope, reporter)
         errors = [d for d in reporter.diagnostics if d.severity.value == "error"]
@@ -151,7 +151,7 @@ class AddedPacks:
         return frozenset(d.primary.span for d in errors if d.primary.span is not None)
 
     def _additions(self, element: str, scope: tuple[str, ...], words: frozenset[str]) -> list[Cause]:
-        """The tags among some words that packs outside a scope give an element, else their values, else the element."""
+        """The tags among some words that packs outside a scope add to an element, else their values, or the element."""
         composition = self.composition
         tags: list[Cause] = []
         values: list[Cause] = []
@@ -166,7 +166,7 @@ class AddedPacks:
                 for scalar in scalars:
                     word = composition.names.of(pack, scalar.word)
                     if word.rpartition(".")[2] in words:
-                        causes.append(Cause(pack, scalar.span, f"gives `{element}` the {noun} `{word}`"))
+                        causes.append(Cause(pack, scalar.span, f"adds the {noun} `{word}` to `{element}`"))
         owner = composition.elements[element]
         added = [] if owner.pack in scope else [Cause(owner.pack, owner.span, f"adds `{element}`")]
         return tags or values or added

@@ -1,8 +1,7 @@
-"""Declarations of several packs -> one composition: every name defined once, an id for each element, passes in order.
+"""Declarations of several packs -> one composition, with unique names, ids of elements, and ordered passes.
 
-Ids are assigned here, or recorded in a palette, which has the qualified name of the element of each id, or None where
-an id is free. Worlds, datasets and checkpoints keep one, so that they mean the same elements whatever else is loaded
-later.
+Ids are assigned here, or recorded in a palette: the qualified name of the element of each id, or None for a free id.
+Worlds, datasets and checkpoints store one, so that ids keep their meaning whatever is loaded later.
 """
 
 from __future__ import annotations
@@ -81,13 +80,13 @@ class Composition:
     """By ascending id."""
     slots: int
     order: dict[int, int]
-    """The place of each id where loops run over elements: as if no palette had been recorded."""
+    """The position of each id in loops over elements, as without a palette."""
     group: dict[str, int]
-    """By pack: the number of the group in which its elements and channels lie; the first group lies as if alone."""
+    """By pack: the number of the group of its elements and channels. The first group is placed as if it were alone."""
     own_slots: int
-    """How many ids the first group has room for, packs that are left out included."""
+    """The number of ids reserved for the first group, including packs that are left out."""
     properties: dict[str, Property] = field(default_factory=dict)
-    """This and what follows is added by `check.resolve_names`."""
+    """This and the following attributes are set by `check.resolve_names`."""
     fields: dict[str, Field] = field(default_factory=dict)
     streams: dict[str, Stream] = field(default_factory=dict)
     params: dict[str, Param] = field(default_factory=dict)
@@ -100,11 +99,11 @@ class Composition:
 
     @property
     def first_id(self) -> int:
-        """The element that fields of elements hold unless their file says otherwise."""
+        """The default of fields of kind ``element``."""
         return min(self.names_by_id, key=self.order.__getitem__)
 
     def is_declared(self, name: str, pack: str) -> bool:
-        """True if some pack declares the name, even with a wrong declaration."""
+        """True if some pack declares the name, even incorrectly."""
         return self.names.of(pack, name) in self.names.versions or f"{pack}.{name}" in self.param_decls
 
     @cached_property
@@ -122,7 +121,7 @@ class Composition:
         return frozenset(words)
 
     def scope(self, author: str | RulesetDecl, words: Iterable[str] = ()) -> tuple[str, ...]:
-        """The packs that the author of a pack or ruleset knew, in load order. All others were added.
+        """The packs in the scope of a pack or ruleset, in load order. All others were added.
 
         These are a ruleset's packs, or the pack and those of the ruleset that lists it; the packs that define some
         words that the author uses; and all that these need.
@@ -174,7 +173,7 @@ class Composition:
                 yield decl.pack, name, self.names.of(decl.pack, key.word), key, syntax
 
     def glyphs_alone(self, packs: Sequence[str]) -> dict[str, str]:
-        """The glyphs of elements, by global name, as they are where only some packs are loaded."""
+        """The glyphs of elements, by global name, if only some packs are loaded."""
         alone = {}
         for pack in packs:
             for decl in self.packs[pack].elements:
@@ -188,7 +187,7 @@ class Composition:
 
 
 def _mark_optional(also: AlsoDecl, names: frozenset[str]) -> AlsoDecl:
-    """The addition of a ruleset to an element, with a `?` behind some names."""
+    """The addition of a ruleset to an element, with a `?` after some names."""
 
     def optional(scalar: Scalar) -> Scalar:
         return replace(scalar, text=f"{scalar.text}?") if scalar.text in names else scalar
@@ -199,7 +198,7 @@ def _mark_optional(also: AlsoDecl, names: frozenset[str]) -> AlsoDecl:
 
 
 def with_optional(syntax: Syntax, names: frozenset[str]) -> Syntax:
-    """The expression with a `?` behind some names."""
+    """The expression with a `?` after some names."""
     kind = "optional_name" if syntax.kind == "name" and syntax.text in names else syntax.kind
     return replace(
         syntax, kind=kind, children=tuple(with_optional(child, names) for child in syntax.children)
@@ -211,7 +210,7 @@ def compose(
 ) -> Composition:
     """Merge packs in the order given. Reports clashes of names and ids, missing packs, and cycles of passes.
 
-    `palette` has ids that were recorded earlier.
+    `palette` has recorded ids.
     """
     ruleset = ruleset or NO_RULESET
     loaded = with_stand_ins(packs)
@@ -227,7 +226,7 @@ def compose(
     for name, (old, _) in ruleset.renames.items():
         if name not in names.renamed | passes.renamed and name.partition(".")[0] not in ruleset.left_out:
             reporter.error(
-                "PD310", f"nothing is called `{name}`", old.span, "no loaded pack defines this",
+                "PD310", f"nothing is named `{name}`", old.span, "no loaded pack defines this",
                 helps=["write the pack's name, a point, and the name that it defines: `pack.word`"],
             )  # fmt: skip
     declared = names.declared(ElementDecl)
@@ -251,7 +250,7 @@ def compose(
         top = beyond[-1]
         reporter.error(
             "PD402", f"element `{top.name}` has id {top.id}, but the ruleset has {wanted} slots", top.span,
-            helps=[f"say `slots: {top.id + 1}` in {ruleset.layout_ruleset.source.name}"],
+            helps=[f"write `slots: {top.id + 1}` in {ruleset.layout_ruleset.source.name}"],
         )  # fmt: skip
     composition = Composition(
         packs=loaded,
@@ -278,7 +277,7 @@ def title(loaded: Collection[str], ruleset: RulesetDecl) -> str:
 
 
 def _check_needs(loaded: Mapping[str, PackDecl], left_out: Collection[str], reporter: Reporter) -> None:
-    """Report packs that cannot be loaded together, and packs that are needed and not loaded."""
+    """Report packs that cannot be loaded together, and required packs that are not loaded."""
     stands_in: dict[str, PackDecl] = {}
     missing: dict[str, dict[str, Span]] = {}
     for name, pack in loaded.items():
@@ -303,11 +302,11 @@ def _check_needs(loaded: Mapping[str, PackDecl], left_out: Collection[str], repo
     for name, needing in missing.items():
         first, *others = needing
         count = f" and {len(others)} others need" if others else " needs"
-        fix = f"put `{name}.yaml` into the folder of `{loaded[first].source.name}`: none is shipped"
+        fix = f"no such pack is shipped: put `{name}.yaml` into the folder of `{loaded[first].source.name}`"
         if close := get_close_matches(name, sorted(loaded.keys() - needing.keys()), n=1, cutoff=0.75):
             fix = f"did you mean `{close[0]}`?"
         elif name in left_out:
-            fix = f"leave out what needs it too: {', '.join(f'`-{pack}`' for pack in needing)}"
+            fix = f"also leave out the packs that need it: {', '.join(f'`-{pack}`' for pack in needing)}"
         reporter.error(
             "PD305", f"pack `{first}`{count} `{name}`, which is not loaded", needing[first], "not loaded",
             secondary=[Label(needing[pack], "needed here too") for pack in others[:3]], helps=[fix],
@@ -318,10 +317,10 @@ def _check_needs(loaded: Mapping[str, PackDecl], left_out: Collection[str], repo
 
 
 def _groups(packs: Mapping[str, PackDecl], ruleset: RulesetDecl) -> list[list[PackDecl]]:
-    """The packs whose elements and channels are placed together, one group after the other.
+    """Groups of packs whose elements and channels are placed together.
 
-    A ruleset's own packs come first, packs that it leaves out included, because their positions stay reserved. Each
-    further pack follows by itself, after the packs that it needs: the order in which packs are named matters little.
+    A ruleset's own packs come first, including those that it leaves out, whose positions stay reserved. Each further
+    pack forms a group after those that it needs, so that the order in which packs are named matters little.
     """
     own = ruleset.leading_packs
     groups = [
@@ -334,9 +333,9 @@ def _groups(packs: Mapping[str, PackDecl], ruleset: RulesetDecl) -> list[list[Pa
 
 
 def _id_requests(group: Sequence[PackDecl], names: Names, reporter: Reporter) -> list[ElementDecl]:
-    """The elements of some packs in the order in which ids are assigned: elements that ask for an id come first.
+    """The elements of some packs in the order in which ids are assigned, those that request an id first.
 
-    An element that overrides another one asks for the same id unless its file says another one, which is a warning.
+    An element that overrides another requests the same id; another id in its file is a warning.
     Elements of packs that are left out keep their ids reserved.
     """
     requests: list[ElementDecl] = []
@@ -351,7 +350,7 @@ def _id_requests(group: Sequence[PackDecl], names: Names, reporter: Reporter) ->
                 reporter.report(
                     "PD318", f"`{new.name.text}` gets the id {new.number} instead of {old.number}", new.id.span,
                     "its channel moves too", secondary=[Label(old.id.span, "the id of the element that it replaces")],
-                    helps=["leave out `id`: an element that overrides another keeps its id"],
+                    helps=["omit `id`: an element that overrides another keeps its id"],
                 )  # fmt: skip
         if asking:
             requests.append(replace(versions[0], id=asking[0].id))
@@ -363,11 +362,11 @@ def _id_requests(group: Sequence[PackDecl], names: Names, reporter: Reporter) ->
 def _ids(
     groups: Sequence[Sequence[ElementDecl]], names: Names, of_ruleset: bool, palette: Palette = ()
 ) -> dict[str, int]:
-    """Ids by qualified name. Earlier groups come first, so further packs change nothing.
+    """Ids by qualified name. Earlier groups come first, so that further packs do not change them.
 
-    An element has the id that a palette has for it, or for one that it overrides. Else it has the id that its file
-    gives, unless that is taken or beyond the palette. All others have the lowest free id: above those of the ruleset's
-    packs, the first group, or, without a ruleset, above all ids so far; under a palette anywhere.
+    An element gets the id that a palette has for it or for the element that it overrides, or else the id in its file,
+    unless that is taken or beyond the palette. All others get the lowest free id: above those of the ruleset's packs
+    (the first group) or, without a ruleset, above all ids so far; with a palette, anywhere.
     """
     recorded = {name: number for number, name in enumerate(palette) if name is not None}
     ids: dict[str, int] = {}
@@ -415,13 +414,13 @@ def _report_ids(
             reporter.error(
                 "PD303", f"elements `{first.name.text}` and `{decl.name.text}` have the same id {wanted}",
                 decl.id.span, "already taken", secondary=[Label(first.span, "by this one")],
-                helps=["leave out `id:`: the element gets a free one"],
+                helps=["omit `id:`: the element gets a free one"],
             )  # fmt: skip
         elif not recorded and ids.get(name, wanted) != wanted:
             reporter.report(
                 "PD313", f"`{name}` has id {ids[name]} here, not {wanted}",
                 decl.id.span, f"`{holders[wanted]}` has id {wanted}",
-                notes=["saved worlds, datasets and checkpoints know elements by name, not by id"],
+                notes=["saved worlds, datasets and checkpoints refer to elements by name, not by id"],
             )  # fmt: skip
 
 
@@ -431,7 +430,7 @@ def _report_ids(
 def _elements(
     declared: Mapping[str, ElementDecl], ids: Mapping[str, int], reporter: Reporter
 ) -> dict[str, Element]:
-    """The elements by ascending id. A glyph that another element has already is replaced by a free one."""
+    """The elements by ascending id. A glyph that another element already has is replaced by a free one."""
     owners: dict[str, ElementDecl] = {}
     for decl in declared.values():
         first = owners.setdefault(decl.glyph, decl) if decl.glyph else decl
@@ -503,13 +502,13 @@ Channels = dict[str, list[MatrixChannel]]
 def lay_out(
     composition: Composition, passes: tuple[Pass, ...], reporter: Reporter
 ) -> tuple[tuple[str, ...], tuple[MatrixChannel, ...]]:
-    """The names of all that a cell holds besides its element, in order, and the channels of `World.matrix()`.
+    """The names of all that a cell stores besides its element, in order, and the channels of `World.matrix()`.
 
     The packs of a ruleset come first, as its `matrix:` lists them, with a channel for each of its ids; without a ruleset
     the first pack does. For each further pack follow, in load order, its elements, the properties that its rules are the
     first to assign, and its fields. So channels keep their place when packs are added.
 
-    Reports names in a ruleset's `matrix:` that no loaded pack has.
+    Reports names in a ruleset's `matrix:` that no loaded pack defines.
     """
     fields, names, size = composition.fields, composition.names_by_id, composition.own_slots
     known: Channels = {name: [MatrixChannel(name, name)] for name in (*composition.properties, *fields)}
@@ -518,7 +517,7 @@ def lay_out(
             known[name] = [MatrixChannel(f"{name}.{part}", name, part=part) for part in COMPONENTS]
     blocks = _blocks(composition, passes)
     parts: list[list[MatrixChannel]] = [[] for _ in range(2 * len(blocks))]
-    """The channels of elements and those of what lasts from step to step, in turn, by group of packs."""
+    """The channels of elements, and those of persistent fields and properties, in turn, by group of packs."""
     for number in sorted({*range(size), *names}):
         group = composition.group[composition.elements[names[number]].pack] if number >= size else 0
         parts[2 * group].append(MatrixChannel(names.get(number, ""), id=number))
@@ -530,7 +529,7 @@ def lay_out(
     if written:
         own = [_named_channels(scalar, known, composition, reporter) for scalar in written]
         shown = [parts[0] if channels is None else channels for channels in own]
-        # A ruleset that shows no elements shows none of further packs either.
+        # A ruleset without channels of elements has none for further packs either.
         parts = [*shown, *parts[2:]] if None in own else shown
     order = tuple(name for block in blocks for name in block)
     return order, tuple(channel for part in parts for channel in part)
@@ -556,7 +555,7 @@ def _blocks(composition: Composition, passes: tuple[Pass, ...]) -> list[list[str
 def _named_channels(
     scalar: Scalar, known: Channels, composition: Composition, reporter: Reporter
 ) -> list[MatrixChannel] | None:
-    """The channels that a name under `matrix:` stands for: of a field, a property or a component, plain or qualified.
+    """The channels of a name under `matrix:`, the plain or qualified name of a field, a property or a component.
 
     None for all elements; one channel that is always 0 if its pack is not loaded.
     """

@@ -1,6 +1,6 @@
-"""Name resolution: one namespace over all packs, in which packs that do not know each other may clash.
+"""Name resolution: one namespace for all packs, in which unrelated packs may clash.
 
-Passes have a namespace of their own; they run in the order that `after` and `before` ask for, then in load order.
+Passes have a separate namespace; they run in the order of `after` and `before`, then in load order.
 """
 
 from __future__ import annotations
@@ -35,16 +35,16 @@ D = TypeVar("D", bound=Definition)
 MAX_PASSES = 200
 
 STATE = frozenset(("element", "ids"))
-"""Names that Python and files reserve for the elements of cells; fields and properties need others."""
+"""Names reserved for the elements of cells in Python and files, which fields and properties cannot have."""
 
 
 class Names:
     """Every global name in some sections of packs. Clashes are reported.
 
     The first pack that defines a word keeps it as its global name. A pack that neither needs that one nor is needed by
-    it may define the same word: its definition is known as ``pack.word``. So adding a pack renames nothing.
+    it may define the same word: its definition is known as ``pack.word``. So adding a pack never renames anything.
 
-    `rename` gives, by qualified name, where it is written, and the other global name. Words `reserved` name nothing.
+    `rename` maps qualified names to a span and another global name. `reserved` words cannot be names.
     """
 
     def __init__(
@@ -64,16 +64,16 @@ class Names:
         """A pack, and all packs that it needs, directly or not."""
         self.packs = packs
         self.versions: dict[str, list[Any]] = {}
-        """By global name: the declaration that holds, then those that it overrides."""
+        """By global name: the declaration in effect, then those that it overrides."""
         self.known: dict[str, str] = {}
-        """Global names by qualified name, those of elements and passes that a pack overrides among them."""
+        """Global names by qualified name, including overridden elements and passes."""
         for section in sections:
             for pack in packs.values():
                 for decl in getattr(pack, section):
                     self._define(decl)
 
     def of(self, pack: str, word: str) -> str:
-        """The global name that a word, plain or qualified, means in a pack. Unknown words stay as they are."""
+        """The global name of a plain or qualified word in a pack. Unknown words are returned unchanged."""
         return self._first(self.needs.get(pack, ()), word) or self.known.get(word, word)
 
     def _first(self, packs: Iterable[str], word: str) -> str | None:
@@ -95,7 +95,7 @@ class Names:
         return self.pack(name) in (None, *self.needs.get(pack, (pack,)))
 
     def check_word(self, scalar: Scalar | Syntax, noun: str, more: frozenset[str] = frozenset()) -> bool:
-        """True if a word may name something. Reports a reserved word."""
+        """True if a word may be a name. Reports reserved words."""
         is_reserved = scalar.text in self.reserved | more
         if is_reserved:
             self.reporter.error(
@@ -129,7 +129,7 @@ class Names:
         name = new.text if new is not None else word if word not in self.versions else decl.qualified
         if other is not None or name in self.versions:
             first = self.versions[name if other is None else other][-1]
-            override = f"; to replace {decl.NOUN} say `override: yes`" if hasattr(decl, "override") else ""
+            override = f"; to replace {decl.NOUN}, write `override: yes`" if hasattr(decl, "override") else ""
             clash = scalar if other is not None or new is None else new
             self.reporter.error(
                 "PD302", f"{'pass ' * isinstance(decl, PassDecl)}`{clash.text}` is defined twice", clash.span,
@@ -140,16 +140,16 @@ class Names:
         if name == decl.qualified:
             first, noun = self.versions[word][-1], decl.NOUN.partition(" ")[2]
             self.reporter.report(
-                "PD312", f"the {noun} `{word}` of `{decl.pack}` is known as `{name}` here", scalar.span,
+                "PD312", f"the {noun} `{word}` of `{decl.pack}` is named `{name}` here", scalar.span,
                 f"`{first.pack}` defines `{word}` too",
                 secondary=[Label(first.span, f"{first.NOUN} of {first.pack}")],
-                notes=[f"in the rules of `{decl.pack}`, `{word}` still means its own"],
+                notes=[f"in the rules of `{decl.pack}`, `{word}` still refers to its own"],
             )  # fmt: skip
         self.versions[name] = [decl]
         self._know(decl, name)
 
     def _know(self, decl: Definition, name: str) -> None:
-        """Remember the global name of a definition, also under the packs that its pack stands in for."""
+        """Record the global name of a definition, also under the packs that its pack provides."""
         self.known[decl.qualified] = name
         for other in self.packs[decl.pack].provides:
             self.known.setdefault(f"{other.text}.{decl.name.text}", name)
@@ -173,7 +173,7 @@ def words_of(syntax: Syntax) -> Iterator[str]:
 def report_unknown(
     kind: str, scalar: Scalar, known: Iterable[str], reporter: Reporter, code: str = "PD301", more: str = ""
 ) -> None:
-    """Report a name that no loaded pack defines, unless it may be absent. `more` is what else may help."""
+    """Report a name that no loaded pack defines, unless it is optional. `more` is further help."""
     if scalar.is_optional:
         return
     kinds = {"pass": "passes", "property": "properties"}.get(kind, f"{kind}s")
@@ -200,7 +200,7 @@ def needs_of(packs: Mapping[str, PackDecl]) -> dict[str, tuple[str, ...]]:
 
 
 def with_stand_ins(packs: Iterable[PackDecl]) -> dict[str, PackDecl]:
-    """Packs by name. They need the packs that provide what is not loaded instead of that."""
+    """Packs by name, with needs that are not loaded replaced by the packs that provide them."""
     loaded = {pack.name.text: pack for pack in packs}
     provider = dict(zip(loaded, loaded, strict=True))
     for name, pack in loaded.items():
@@ -213,7 +213,7 @@ def with_stand_ins(packs: Iterable[PackDecl]) -> dict[str, PackDecl]:
 
 
 def in_order(names: Iterable[str], after: Mapping[str, Collection[str]]) -> list[str]:
-    """The names in a stable topological order; names of a cycle keep their order."""
+    """The names in a stable topological order; the names of a cycle keep their order."""
     ordered: list[str] = []
     waiting = list(names)
     while waiting:
@@ -224,7 +224,7 @@ def in_order(names: Iterable[str], after: Mapping[str, Collection[str]]) -> list
 
 
 def needed_first(packs: Mapping[str, PackDecl]) -> list[str]:
-    """The packs in load order, but each after the packs that it needs. Packs that need each other keep their order."""
+    """The packs in load order, but after those that they need. Packs that need each other keep their order."""
     return in_order(packs, needs_of(packs))
 
 
@@ -232,7 +232,7 @@ def needed_first(packs: Mapping[str, PackDecl]) -> list[str]:
 
 
 def order_passes(names: Names, reporter: Reporter) -> dict[str, PassDecl]:
-    """The passes sorted by `after` and `before`, then by load order. A pass that overrides another takes its place."""
+    """The passes sorted by `after` and `before`, then by load order. An overriding pass takes the other's position."""
     passes = names.declared(PassDecl)
     if len(passes) > MAX_PASSES:
         last = list(passes.values())[MAX_PASSES].span
@@ -255,11 +255,11 @@ def order_passes(names: Names, reporter: Reporter) -> dict[str, PassDecl]:
         TopologicalSorter(earlier).prepare()
     except CycleError as error:
         cycle = error.args[1][:0:-1]
-        start = cycle.index(max(cycle, key=[*passes].index))  # likely in the file that is being written
+        start = cycle.index(max(cycle, key=[*passes].index))  # likely in the file being edited
         cycle = [*cycle[start:], *cycle[: start + 1]]  # each pass comes after the next one
         places = [(earlier[later][first], f"`{first}` before `{later}`") for later, first in pairwise(cycle)]
         message = "the order of passes is a cycle: " + " after ".join(f"`{name}`" for name in cycle)
-        helps, others = ["take one of these names out of its `after` or `before`"], places[1:]
+        helps, others = ["remove one of these names from its `after` or `before`"], places[1:]
         reporter.error("PD307", message, *places[0], secondary=[Label(*p) for p in others], helps=helps)
     return {name: passes[name] for name in in_order(passes, earlier)}
 
@@ -278,9 +278,9 @@ def report_misspelled(
     elsewhere: Callable[[], Mapping[str, str]],
     reporter: Reporter,
 ) -> None:
-    """Warn of optional names that no pack defines but that are close to a name that some pack defines.
+    """Warn of optional names that no pack defines but that resemble a defined name.
 
-    `elsewhere`: returns the words of packs that are not loaded, with the packs. Called only if it matters.
+    `elsewhere`: returns the words of packs that are not loaded, with the packs; called only if needed.
     """
     known: set[str] = set()
     for pack in (*packs, *ruleset.left_out.values()):
@@ -329,7 +329,7 @@ def _optional_names(value: object) -> Iterator[tuple[str, Span]]:
             if value.kind == "optional_name":
                 yield value.text.removesuffix("?"), value.span
             parts: Iterable[object] = value.children
-        case TestDecl():  # in its worlds a `?` stands for anything
+        case TestDecl():  # in its worlds, a `?` matches anything
             keys = tuple(key for key, _ in (*value.fields, *value.expect_fields, *value.params))
             parts = (value.legend, value.always, value.often, keys)
         case RulesetDecl():
@@ -345,7 +345,7 @@ def _optional_names(value: object) -> Iterator[tuple[str, Span]]:
 
 
 def _closest(word: str, names: Sequence[str]) -> str | None:
-    """The name that a word misspells. Short words, and the first letter, are taken to be right: `ash` is not `dash`."""
+    """The name that a word misspells. Short words and first letters are assumed to be right: `ash` is not `dash`."""
     longer = [name for name in names if name[0] == word[0] and min(len(name), len(word)) > 3]
     turned = (name for name in longer if sorted(name) == sorted(word))
     return next(iter(get_close_matches(word, longer, n=1, cutoff=0.8)), None) or next(turned, None)

@@ -43,12 +43,12 @@ if TYPE_CHECKING:
 
 
 MAX_CHAIN = 16
-"""Longest chain of `and` or `or` that nests to one side: what walks expressions recurses."""
+"""Longest chain of `and` or `or` that nests to one side, since walks over expressions recurse."""
 
 
 @dataclass(frozen=True)
 class SetOf:
-    """A set of elements, ids ascending. `name` is set where a rule names one element."""
+    """A set of elements with ascending ids. `name` is set if a rule names a single element."""
 
     ids: tuple[int, ...]
     name: str | None = None
@@ -56,14 +56,14 @@ class SetOf:
 
 @dataclass(frozen=True)
 class Place:
-    """This cell or a neighbor. As a value it is the element found there."""
+    """This cell or a neighbor. As a value, it is the element there."""
 
     offset: Offset
 
 
 @dataclass(frozen=True)
 class PlaceChoice:
-    """A choice by a condition between two places. As a value it is an element, or a direction."""
+    """A choice between two places by a condition. As a value, it is an element or a direction."""
 
     condition: Expr
     yes: Place | PlaceChoice
@@ -94,14 +94,14 @@ class Absent:
 
 @dataclass(frozen=True)
 class Broken:
-    """A name whose definition has been reported: using it is not a second mistake."""
+    """A name whose definition has been reported, so that using it is not a second mistake."""
 
 
 Operand = Expr | SetOf | Place | PlaceChoice | Bounds | Items | Kernel | Absent | Broken
 
 
 class Poisoned(Exception):
-    """This expression has been reported already: whatever contains it stays silent."""
+    """This expression has already been reported, so expressions that contain it are not."""
 
 
 class Unresolved(Exception):
@@ -142,12 +142,12 @@ TRUE, FALSE = Expr("const", FLAG, value=1), Expr("const", FLAG, value=0)
 
 
 def number(value: float | Fraction) -> Expr:
-    """An exact constant, of no kind until something takes it."""
+    """An exact constant, without a kind until it is used."""
     return Expr("const", NUMBER, value=Fraction(value))
 
 
 def look(value: Expr, offset: Offset, span: Span | None = None) -> Expr:
-    """A value at a neighbor; offsets of nested looks add up, constants are the same everywhere."""
+    """A value at a neighbor. Nested offsets add up; constants are the same everywhere."""
     if value.op == "look":
         inner = value.value
         assert isinstance(inner, tuple)
@@ -183,7 +183,7 @@ disjunction = partial(_fold, "or", FALSE, TRUE)
 
 
 def _join(op: str, values: list[Expr], span: Span | None) -> Expr:
-    """All values under one operation, pair by pair from the left; long lists as a balanced tree."""
+    """All values combined by an operation, in pairs from the left; long lists as a balanced tree."""
     if len(values) > MAX_CHAIN:
         middle = len(values) // 2
         halves = (_join(op, values[:middle], span), _join(op, values[middle:], span))
@@ -201,7 +201,7 @@ MAX_MODULUS = 64
 
 
 def kind_name(value: Operand | None) -> str:
-    """The name of a runtime value's kind; nothing for other operands."""
+    """The name of a runtime value's kind; empty for other operands."""
     return value.kind.name if isinstance(value, Expr) else ""
 
 
@@ -242,15 +242,15 @@ def arithmetic(typer: Typer, op: str, values: Sequence[PlacedValue], span: Span)
 # Comparisons
 
 _COMPARABLE = {
-    FLAG: ("a condition", "a condition holds or not: write it, or `not` and it"),
-    ELEMENT: ("an element", "ask for an element, or one of a set, with `is`"),
+    FLAG: ("a condition", "a condition is true or false: write it, or `not` and the condition"),
+    ELEMENT: ("an element", "test for an element, or one of a set, with `is`"),
     DIRECTION: ("a direction", "such as `left`, or `at(-1, 1)`"),
 }
-"""Kinds that are compared with their own kind only: in words, and the fix."""
+"""Kinds that are only compared with values of the same kind: in words, and the fix."""
 
 
 def compare(typer: Typer, sign: str, left: PlacedValue, right: PlacedValue, span: Span) -> Expr:
-    """A comparison as `eq`, `lt` or `le`, maybe negated."""
+    """A comparison as `eq`, `lt` or `le`, possibly negated."""
     if sign == "!=":
         return negation(compare(typer, "==", left, right, span), span)
     if sign in (">", ">="):
@@ -267,7 +267,7 @@ def compare(typer: Typer, sign: str, left: PlacedValue, right: PlacedValue, span
         return _compare_discrete(typer, op, left, right, span)
     kind = INTEGER if kinds == {"int"} else REAL
     if kind == INTEGER:
-        # A bound such as 1.5 is rounded to the integer that means the same.
+        # A bound such as 1.5 is rounded to the equivalent integer.
         if op == "eq" and not (is_integer(a) and is_integer(b)):
             return FALSE
         if not is_integer(a):
@@ -284,11 +284,11 @@ def _compare_discrete(typer: Typer, op: str, left: PlacedValue, right: PlacedVal
             if other.kind != value.kind:
                 raise typer.wrong(other, f"{words} to compare with {words}", place, fix)
             if op != "eq":
-                message = f"{words} is not more or less than another"
+                message = f"{words} cannot be more or less than another"
                 raise typer.fail("PD401", message, span, "has no order", "use `==` or `!=`")
             return Expr(op, FLAG, (left[0], right[0]), span=span)
     fix = "compare `length(…)`, or `.row` and `.column`"
-    raise typer.fail("PD401", "vectors are not compared", span, "one side is a vector", fix)
+    raise typer.fail("PD401", "vectors cannot be compared", span, "one side is a vector", fix)
 
 
 def _compare_draw(typer: Typer, op: str, left: PlacedValue, right: PlacedValue, span: Span) -> Expr:
@@ -298,13 +298,13 @@ def _compare_draw(typer: Typer, op: str, left: PlacedValue, right: PlacedValue, 
     first = left[0].kind.name == "draw"
     (draw, _), (other, place) = (left, right) if first else (right, left)
     if other.kind.name == "draw":
-        raise typer.fail("PD401", "two draws are not compared", span, "one side must be a number")
+        raise typer.fail("PD401", "two draws cannot be compared", span, "one side must be a number")
     if other.kind == NUMBER:
         if not draw.kind.lo <= other.value <= draw.kind.hi:
             if (draw.kind.lo, draw.kind.hi) == (0, 1):
                 shown = f"{float(other.value):g}"
                 fix = f"`{shown}%`" if 0 <= other.value <= 100 else "a chance such as `20%`"
-                message, label = f"a draw compared with {shown}", "draws lie between 0 and 1"
+                message, label = f"a draw compared with {shown}", "draws are between 0 and 1"
                 raise typer.fail("PD403", message, place, label, f"did you mean {fix}?")
             return TRUE if (other.value > draw.kind.hi) == first else FALSE
         kind = CHANCE if 0 <= other.value <= 1 else NUMBER
@@ -315,7 +315,7 @@ def _compare_draw(typer: Typer, op: str, left: PlacedValue, right: PlacedValue, 
     elif other.kind.name not in ("chance", "number", "int"):
         fix = "such as `5%`, a parameter or a property"
         raise typer.wrong(other, "a chance to compare the draw with", place, fix)
-    # A draw lies strictly between two multiples of its resolution's half step: `<` and `<=` mean the same.
+    # A draw is strictly between two multiples of half its resolution, so `<` and `<=` are equivalent.
     return Expr("lt", FLAG, (draw, other) if first else (other, draw), span=span)
 
 
@@ -327,9 +327,9 @@ def _check_resolution(typer: Typer, draw: Expr, chance: Fraction, span: Span) ->
     steps = 1 << (stream.bits if stream else 32)
     nearest = Fraction(max(0, ceil(chance * steps - Fraction(1, 2))), steps)
     if abs(nearest - chance) > chance / 20:
-        message = f"a chance of {float(100 * chance):.3g}% is drawn as {float(100 * nearest):.3g}%"
+        message = f"a chance of {float(100 * chance):.3g}% is rounded to {float(100 * nearest):.3g}%"
         label = f"this stream draws in steps of 1/{steps}"
-        fix = "declare the stream with `bits: 32`, or say `with chance`"
+        fix = "declare the stream with `bits: 32`, or write `with chance`"
         typer.reporter.report("PD404", message, span, label, helps=[fix])
 
 
@@ -337,7 +337,7 @@ def _check_resolution(typer: Typer, draw: Expr, chance: Fraction, span: Span) ->
 
 
 def membership(typer: Typer, left: Operand, right: Operand, syntax: Syntax) -> Expr:
-    """The condition `left is right` or `left in right`, for every pair of operands that is allowed."""
+    """The condition `left is right` or `left in right`, for every allowed pair of operands."""
     span = syntax.span
     first, second = (child.span for child in syntax.children)
     match left, right:
@@ -362,9 +362,9 @@ def membership(typer: Typer, left: Operand, right: Operand, syntax: Syntax) -> E
         ):  # the others join to a set of elements
             return disjunction([_equals(typer, left, item, syntax) for item in right.items], span)
         case _, Expr() if right.kind == NUMBER:
-            message, fix = "`in` asks for a range or a set", "compare numbers with `==`"
+            message, fix = "`in` needs a range or a set", "compare numbers with `==`"
             if syntax.kind in ("is_", "is_not"):
-                message = "`is` asks for an element or a direction"
+                message = "`is` needs an element or a direction"
             elif syntax.children[1].kind == "sub":
                 fix = "a range is written `LOW..HIGH`"
             raise typer.fail("PD401", message, second, "this is a number", fix)
@@ -399,10 +399,10 @@ def calculation(typer: Typer, syntax: Syntax, scope: Scope, modulus: int = 0) ->
     for child in syntax.children:
         value = _coordinate_sum(typer, child, modulus, scope) if modulus else typer.value_of(child, scope)
         if value.kind in _COMPARABLE:
-            helps = ["an item of a list has a blank after its `-`"] if op == "neg" else []
+            helps = ["write a space after the `-` of a list item"] if op == "neg" else []
             raise typer.wrong(value, "a number", child.span, *helps)
         if op == "quotient" and value.kind.name == "real":
-            raise typer.wrong(value, "an integer", child.span, "`div` divides integers; for floats say `/`")
+            raise typer.wrong(value, "an integer", child.span, "`div` divides integers; `/` divides floats")
         if op == "quotient" and not is_integer(value):
             value = typer.of_kind(value, INTEGER, child.span)
         values.append((value, child.span))
@@ -414,17 +414,17 @@ def calculation(typer: Typer, syntax: Syntax, scope: Scope, modulus: int = 0) ->
     if result.kind != NUMBER:
         return typer.check_range(result, span)
     if abs(result.value) > 10**6 or result.value.denominator > 10**18:
-        raise typer.fail("PD402", "a constant out of reach", span, "numbers go up to 1,000,000")
+        raise typer.fail("PD402", "a constant out of range", span, "numbers go up to 1,000,000")
     return result
 
 
 def _on_vectors(typer: Typer, op: str, values: Sequence[PlacedValue], span: Span) -> Expr:
     vectors = [value.kind.name == "vec2" for value, _ in values]
     if op in ("add", "sub") and not all(vectors):
-        message, fix = "a vector adds up with vectors only", "write `vector(rows, columns)`"
+        message, fix = "only vectors can be added to a vector", "write `vector(rows, columns)`"
         raise typer.fail("PD401", message, span, "one side is not a vector", fix)
     if (op == "mul" and all(vectors)) or (op == "div" and vectors[1]):
-        message = "a vector is multiplied or divided by a number"
+        message = "a vector can only be multiplied or divided by a number"
         raise typer.fail("PD401", message, span, "the other way round, or two vectors")
     args = (typer.of_kind(v, VEC2 if v.kind.name == "vec2" else REAL, place) for v, place in values)
     return Expr(op, VEC2, tuple(args), span=span)
@@ -443,7 +443,7 @@ def modulo(typer: Typer, syntax: Syntax, scope: Scope) -> Expr:
 
 
 def _coordinate_sum(typer: Typer, syntax: Syntax, modulus: int, scope: Scope) -> Expr:
-    """Sums of coordinates, each reduced by the modulus, so that every part has a small declared range."""
+    """Sums of coordinates, each reduced by the modulus, so that every part has a small range."""
     if syntax.kind == "name" and syntax.text in COORDINATES:
         return Expr("coordinate", integer(0, modulus - 1), (), (syntax.text, modulus), syntax.span)
     if syntax.kind in ("add", "sub"):
@@ -457,7 +457,7 @@ def _coordinate_sum(typer: Typer, syntax: Syntax, modulus: int, scope: Scope) ->
 def _coordinate_quotient(typer: Typer, syntax: Syntax, modulus: int, scope: Scope) -> Expr:
     """`row div n` under `mod m`: the value of `row mod (n · m)`, divided by n."""
     left, right = syntax.children
-    message = "a coordinate is divided by an integer constant"
+    message = "a coordinate can only be divided by an integer constant"
     divisor = integer_constant(typer, right, scope, 1, MAX_MODULUS // modulus, message)
     inner = typer.of_kind(_coordinate_sum(typer, left, modulus * divisor, scope), INTEGER, left.span)
     known = Expr("mod", integer(0, modulus * divisor - 1), (inner,), modulus * divisor, left.span)
@@ -468,7 +468,7 @@ def _coordinate_quotient(typer: Typer, syntax: Syntax, modulus: int, scope: Scop
 def choose(
     typer: Typer, condition: Expr, yes: tuple[Operand, Span], no: tuple[Operand, Span], span: Span
 ) -> Expr | PlaceChoice:
-    """`a if c else b`, both of one kind; ranges of integers are joined. The kind of a choice of places depends on its use."""
+    """`a if c else b`, both of one kind; ranges of integers are joined. Choices between places have a kind by use."""
     if isinstance(yes[0], (Place, PlaceChoice)) and isinstance(no[0], (Place, PlaceChoice)):
         return PlaceChoice(condition, yes[0], no[0])
     a, b = typer.value(*yes), typer.value(*no)
@@ -501,7 +501,7 @@ def call(typer: Typer, syntax: Syntax, scope: Scope) -> Operand:
         meant = ELSEWHERE.get(name.lower())
         if name in DIRECTIONS:
             rows, columns = (2 * part for part in DIRECTIONS[name])
-            meant = f"a cell further away is `at(ROWS, COLUMNS)`: here `at({rows}, {columns})`"
+            meant = f"for a cell farther away, write `at(ROWS, COLUMNS)`: here `at({rows}, {columns})`"
         helps = (meant,) if meant else suggest(name, [*FUNCTIONS, *KERNEL_SHAPES], "functions")
         if not helps:
             helps = (f"functions: {', '.join(f'`{known}`' for known in FUNCTIONS)}",)
@@ -513,7 +513,7 @@ def call(typer: Typer, syntax: Syntax, scope: Scope) -> Operand:
         message, label = f"`{name}` takes {wanted}, found {count}", "too few" if count < lo else "too many"
         raise typer.fail("PD406", message, syntax.span, label, f"write `{usage}`")
     if function is None:
-        message, argument = "a radius is an integer constant", syntax.children[0]
+        message, argument = "a radius must be an integer constant", syntax.children[0]
         return shaped_kernel(name, integer_constant(typer, argument, scope, 1, MAX_RADIUS, message))
     if name in CALLS:
         return CALLS[name](typer, syntax, scope)
@@ -561,7 +561,7 @@ def _expand(
 
     names = {name: operand for name, (operand, _) in arguments.items()}
     result = typer.evaluate(placed(_meaning(function)), Scope("", names))
-    # An argument that the meaning repeats is copied, which doubles from call to call.
+    # An argument that the meaning repeats is copied, which doubles with each nested call.
     typer.spend(sum(1 for _ in result.walk()) if isinstance(result, Expr) else 1, span)
     return result
 
@@ -603,7 +603,7 @@ def _neighborhood(typer: Typer, syntax: Syntax, scope: Scope) -> Expr:
 
 
 def _sum_range(kernel: Kernel, lo: float, hi: float) -> Kind:
-    """The range of a weighted sum. A neighbor outside the grid counts as zero, so it is a summand too."""
+    """The range of a weighted sum. A neighbor outside the grid is zero, so zero is a possible summand too."""
     lo, hi = min(lo, 0), max(hi, 0)
     least: float = 0
     most: float = 0
@@ -618,7 +618,7 @@ def _sum_range(kernel: Kernel, lo: float, hi: float) -> Kind:
 
 def _at(typer: Typer, syntax: Syntax, scope: Scope) -> Operand:
     message, label = "`at` takes two integer constants", "not an integer constant"
-    fix = "where it varies, loop over the values: `any(… for n in 0..3)`"
+    fix = "for a variable offset, loop over the values: `any(… for n in 0..3)`"
     most = MAX_MAGNITUDE
     rows, columns = (
         integer_constant(typer, c, scope, -most, most, message, label, fix) for c in syntax.children
@@ -630,7 +630,7 @@ _QUARTERS = {"clockwise": 1, "opposite": 2, "counterclockwise": 3}
 
 
 def _turn(typer: Typer, syntax: Syntax, scope: Scope) -> Operand:
-    """A neighbor or a direction turned clockwise; a mirrored copy of a rule turns it counterclockwise."""
+    """A neighbor or direction turned clockwise, or counterclockwise in a mirrored copy of a rule."""
     (child,) = syntax.children
     operand = typer.evaluate(child, scope)
     if isinstance(operand, PlaceChoice):
@@ -655,7 +655,7 @@ def _pick(typer: Typer, syntax: Syntax, scope: Scope) -> Operand:
     first, *children = syntax.children
     draw = typer.evaluate(first, scope)
     if not isinstance(draw, Expr) or draw.kind != DRAW:
-        fix = "such as `pick(movement, left, right)`: a stream's draw comes first"
+        fix = "such as `pick(movement, left, right)`: write a stream's draw first"
         raise typer.wrong(draw, "a random draw", first.span, fix)
     operands = [(typer.evaluate(child, scope), child.span) for child in children]
     result, place = operands[-1]

@@ -1,4 +1,4 @@
-"""The global names of a composition, resolved, for the checker to look words up in; reports of unknown names."""
+"""The resolved global names of a composition, in which the checker looks up words; reports of unknown names."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def add_constants(composition: Composition) -> None:
         composition.streams[name] = Stream(name, name_number(name), stream.bits)
 
 
-# Literals: no float is involved, `2%` is 1/50
+# Literals, without floats: `2%` is 1/50
 
 
 def read_number(syntax: Syntax, typer: Typer) -> Fraction:
@@ -74,12 +74,12 @@ def read_bounds(syntax: Syntax, typer: Typer) -> tuple[int, int]:
     for end in syntax.children:
         sign, literal = (-1, end.children[0]) if end.kind == "neg" else (1, end)
         if literal.kind != "integer":
-            raise typer.fail("PD405", "a range has integers at its ends", end.span, "not an integer")
+            raise typer.fail("PD405", "the ends of a range must be integers", end.span, "not an integer")
         bounds.append(sign * int(read_number(literal, typer)))
     lo, hi = bounds
     if lo > hi:
         label, fix = f"{lo} is above {hi}", f"write `{hi}..{lo}`"
-        raise typer.fail("PD402", "a range that runs backwards", syntax.span, label, fix)
+        raise typer.fail("PD402", "the bounds are reversed", syntax.span, label, fix)
     return lo, hi
 
 
@@ -93,7 +93,7 @@ _KINDS_ELSEWHERE = {
     **dict.fromkeys(("vector", "vec"), "vec2(-100..100)"),
     "probability": "chance",
 }
-"""Kinds by the names that other languages give them, and how they are written here."""
+"""Kinds by their names in other languages, and their syntax here."""
 
 
 def read_kind(syntax: Syntax, typer: Typer) -> Kind:
@@ -121,7 +121,7 @@ def read_kind(syntax: Syntax, typer: Typer) -> Kind:
 
 
 def default_of(kind: Kind, first_id: int = 0) -> Value:
-    """The default of a kind if the file gives none: zero or the bound nearest to zero; the first element."""
+    """The default of a kind unless the file declares one: zero or the nearest bound; the first element."""
     if kind.name in ("int", "real", "vec2"):
         zero = min(max(0, kind.lo), kind.hi)
         return int(zero) if kind.name == "int" else float(zero) if kind.name == "real" else (zero, zero)
@@ -129,7 +129,7 @@ def default_of(kind: Kind, first_id: int = 0) -> Value:
 
 
 def clamp(default: Value, kind: Kind) -> Value:
-    """A field's default as steps leave it: floats within bounds, and zero where they are smaller than SNAP."""
+    """A field's default after a step: floats clamped to bounds, and zero if smaller than SNAP."""
     if kind.name not in ("real", "vec2"):
         return default
     if isinstance(default, tuple):
@@ -146,13 +146,15 @@ def clamp_number(value: float | Fraction, kind: Kind) -> float:
 
 
 def report_unknown_names(typer: Typer, elsewhere: Callable[[], Mapping[str, str]] = dict) -> None:
-    """Report every name that was looked up and not found, once with all its places, then forget them.
+    """Report every unknown name once, with all its places, then forget them.
 
     `elsewhere` gives the packs of words that are not loaded.
     """
     for (name, after_dot), places in typer.unknown.items():
         first, *others = sorted(places, key=lambda span: (span.source.name, span.start))
-        label = "no loaded pack has such a field or property" if after_dot else "no loaded pack defines it"
+        label = (
+            "no loaded pack defines such a field or property" if after_dot else "no loaded pack defines it"
+        )
         more = [Label(span, "and here") for span in others[:MAX_PLACES]]
         notes = [f"and in {len(others) - MAX_PLACES} more places"] if len(others) > MAX_PLACES else []
         fix = _fix(name, places[first], after_dot, typer.symbols)
@@ -165,12 +167,12 @@ def report_unknown_names(typer: Typer, elsewhere: Callable[[], Mapping[str, str]
 
 
 def report_undeclared_needs(typer: Typer) -> None:
-    """Report the names in rules and values so far that come from packs which their pack does not need."""
+    """Report the names in rules and values so far from packs that their own pack does not need."""
     for (pack, word), span in typer.undeclared.items():
         owner = typer.symbols.names.pack(typer.symbols.names.of(pack, word))
         typer.reporter.report(
             "PD319", f"`{word}` comes from the pack `{owner}`, which `{pack}` does not need", span,
-            "an error where that pack is not loaded",
+            "an error if that pack is not loaded",
             helps=[f"add `{owner}` to the `needs` of `{pack}`, or write `{word}?`"],
         )  # fmt: skip
 
@@ -179,7 +181,7 @@ def _fix(name: str, known_here: Iterable[str], after_dot: bool, symbols: Composi
     """The fix for an unknown name. `known_here` are the local names of its scope."""
     elsewhere = [qualified for qualified in symbols.params if qualified.endswith(f".{name}")]
     if elsewhere:
-        return f"write `{elsewhere[0]}`: a parameter of another pack is named with its pack"
+        return f"write `{elsewhere[0]}`: parameters of other packs are written with their pack"
     if not after_dot and name.lower() in ELSEWHERE:
         return ELSEWHERE[name.lower()]
     params = (qualified.split(".")[1] for qualified in symbols.params)

@@ -1,4 +1,4 @@
-"""Syntax of one expression -> operand of the kind that its place needs: names looked up, kinds checked, constants folded."""
+"""Syntax of an expression -> operand of the required kind, with names resolved, kinds checked and constants folded."""
 
 from __future__ import annotations
 
@@ -67,16 +67,16 @@ from powderdsl.syntax.parse import Syntax
 from powderdsl.syntax.yaml_tree import Scalar
 
 MAX_ROUNDS = 4096
-"""The most rounds of one loop over several variables."""
+"""Maximum number of iterations of a loop over several variables."""
 
 MAX_RULE_WORK = 5_000
-"""The most parts of expressions in one rule, quantifiers written out."""
+"""Maximum number of parts of expressions in one rule, with quantifiers unrolled."""
 
 MAX_WORK = 60_000
-"""The most parts of expressions in all rules: a second or two."""
+"""Maximum number of parts of expressions in all rules, which takes a second or two."""
 
 MAX_SET_DEPTH = 24
-"""The longest chain of sets that are defined by each other."""
+"""Maximum length of a chain of sets defined by one another."""
 
 
 _KINDS = {
@@ -94,11 +94,11 @@ _HELPS: dict[str, tuple[str, ...]] = {
     "vec2": ("such as `vector(1, 0)`: rows down, columns right",),
     "direction": ("such as `left`, or `octant(…)`",),
 }
-"""The fix where a value of a kind is needed."""
+"""The fix if a value of a kind is needed."""
 
 _OPERANDS: dict[type, str] = {
     Place: "a place",
-    PlaceChoice: "a choice of places",
+    PlaceChoice: "a choice between places",
     Bounds: "a range",
     Items: "a list",
     Kernel: "a kernel",
@@ -127,18 +127,18 @@ class Typer:
         self.used: set[str] = set()
         self.absent: set[str] = set()
         self.empty: set[str] = set()
-        """Tags and sets without elements that the rule asks for."""
+        """Empty tags and sets that the rule tests for."""
         self.resolving: list[str] = []
         self.unknown: dict[tuple[str, bool], dict[Span, Iterable[str]]] = {}
-        """By unknown name, and True if it follows a dot: its places, each with the local names there."""
+        """By unknown name and whether it follows a dot: its places, each with the local names there."""
         self.undeclared: dict[tuple[str, str], Span] = {}
-        """The first places of names that a pack uses and no pack that it needs defines."""
+        """The first places of names used by a pack but not defined by a pack that it needs."""
         self._sets_too_deep = False
         self._work = self._rule_start = 0
         self._rule_span: Span | None = None
 
     def evaluate(self, syntax: Syntax, scope: Scope) -> Operand:
-        """The operand that syntax stands for. Raises Poisoned after reporting, Unresolved if it depends on an absent name."""
+        """The operand of some syntax. Raises Poisoned after reporting, Unresolved if it depends on an absent name."""
         self.spend(1, syntax.span)
         match syntax.kind:
             case "yes":
@@ -159,15 +159,15 @@ class Typer:
         return [self.evaluate(child, scope) for child in syntax.children]
 
     def spend(self, parts: int, span: Span) -> None:
-        """Count parts of expressions. Raises Poisoned once a rule, or all of them, have too many."""
+        """Count parts of expressions. Raises Poisoned if a rule, or all rules together, have too many."""
         if self._work > MAX_WORK:
-            raise Poisoned  # that has been reported, and is true of all that follows
+            raise Poisoned  # already reported, and true for everything that follows
         self._work += parts
         if self._work - self._rule_start > MAX_RULE_WORK or self._work > MAX_WORK:
-            self._rule_start = self._work  # once for a rule is enough
+            self._rule_start = self._work  # once per rule is enough
             what = "a rule that expands" if self._work <= MAX_WORK else "rules that expand"
             fix = "loop over fewer things, or name parts under `let:`"
-            label = "written out, it has thousands of parts"
+            label = "unrolled, it has thousands of parts"
             raise self.fail("PD508", f"{what} to too much", self._rule_span or span, label, fix)
 
     def start_rule(self, span: Span) -> None:
@@ -176,14 +176,14 @@ class Typer:
         self.empty.clear()
 
     def condition(self, syntax: Syntax, scope: Scope) -> Expr:
-        """The value of syntax as a flag: elements alone are a test of the element here."""
+        """The value of syntax as a flag: a bare element tests the cell itself."""
         return self.flag(self.evaluate(syntax, scope), syntax.span)
 
     def value_of(self, syntax: Syntax, scope: Scope) -> Expr:
         return self.value(self.evaluate(syntax, scope), syntax.span)
 
     def constant(self, syntax: Syntax, kind: Kind, scope: Scope) -> Constant:
-        """The value of a constant expression. Raises Poisoned after reporting what is wrong with it."""
+        """The value of a constant expression. Raises Poisoned after reporting a mistake."""
         try:
             value = self.of_kind(self.evaluate(syntax, scope), kind, syntax.span)
         except Unresolved as missing:
@@ -198,7 +198,7 @@ class Typer:
         numbers = tuple(part.value for part in parts)
         return numbers if value.op == "vector" else numbers[0]
 
-    # Operands of the kind that their place needs, or reports why not
+    # Operands of the required kind, or a report
 
     def fail(
         self,
@@ -219,7 +219,7 @@ class Typer:
         if isinstance(operand, Expr) and operand.op == "let" and operand.span not in (None, span):
             assert operand.span is not None
             if (operand.span, wanted) in self._misused:
-                return Poisoned()  # one value of the wrong kind is one mistake, however often it is used
+                return Poisoned()  # a value of the wrong kind is one mistake, however often it is used
             self._misused.add((operand.span, wanted))
             secondary = (Label(operand.span, "its value, set here"),)
         description = describe(operand)
@@ -291,7 +291,9 @@ class Typer:
                 return Expr("const", ELEMENT, value=operand.ids[0], span=span)
             case "direction", Place():
                 if operand.offset not in OCTANTS:
-                    raise self.fail("PD401", "not a direction", span, "directions are the eight neighbors")
+                    raise self.fail(
+                        "PD401", "not a direction", span, "directions are those of the eight neighbors"
+                    )
                 return Expr("const", DIRECTION, value=OCTANTS.index(operand.offset), span=span)
         value = operand if kind.name in ("element", "direction") else self.value(operand, span)
         helps = _HELPS.get(kind.name, ())
@@ -302,7 +304,7 @@ class Typer:
             if source == kind.name or (source == "real" and kind.name == "chance"):
                 return value
             if kind.name == "real" and source == "draw" and value.op in ("add", "sub", "look"):
-                # Draws that integers were added to are rounded after each operation.
+                # Draws plus integers are rounded after each operation.
                 args = tuple(self.of_kind(arg, REAL, span) for arg in value.args)
                 return Expr(value.op, REAL, args, value.value, span)
             if source in {"real": ("int", "chance", "draw", "flag"), "chance": ("int",)}.get(kind.name, ()):
@@ -323,16 +325,16 @@ class Typer:
                 if 1 < value <= 100 and "%" not in span.text:
                     fix = f"did you mean `{float(value):g}%`?"
                 message = f"a chance of {float(value * 100):g}%"
-                raise self.fail("PD403", message, span, "chances lie in 0%..100%", fix)
+                raise self.fail("PD403", message, span, "chances are from 0% to 100%", fix)
             case "int" if value.denominator != 1:
-                label = f"{float(value):g} is not whole"
+                label = f"{float(value):g} is not an integer"
                 fix = "write an integer; a field may also be declared as `real(LOW..HIGH)`"
                 raise self.fail("PD401", "expected an integer", span, label, fix)
             case "int" | "real":
                 if kind != REAL and not kind.lo <= value <= kind.hi:
                     label = f"the range is {kind.lo:g}..{kind.hi:g}"
-                    fix = "write a number in this range, or widen it where it is declared"
-                    raise self.fail("PD402", f"{float(value):g} lies outside {kind}", span, label, fix)
+                    fix = "write a number in this range, or widen its declaration"
+                    raise self.fail("PD402", f"{float(value):g} is out of range {kind}", span, label, fix)
                 if kind.name == "int":
                     whole = int(value)
                     return Expr("const", integer(whole, whole), value=whole, span=span)
@@ -341,7 +343,7 @@ class Typer:
 
     def offset(self, offset: Offset, span: Span) -> Offset:
         if max(abs(offset[0]), abs(offset[1])) > MAX_OFFSET:
-            label = f"rules reach {MAX_OFFSET} cells a step"
+            label = f"an offset is at most {MAX_OFFSET} cells"
             raise self.fail("PD409", "the neighbor is too far away", span, label)
         return offset
 
@@ -364,7 +366,7 @@ class Typer:
                 self.undeclared.setdefault((scope.pack, name), span)
             return operand
         if self.symbols.is_declared(name, scope.pack):
-            raise Poisoned  # what is wrong with its declaration has been reported
+            raise Poisoned  # mistakes in its declaration have been reported
         self.unknown.setdefault((name, after_dot), {})[span] = scope.locals
         raise Poisoned
 
@@ -393,14 +395,14 @@ class Typer:
             return Expr("draw", DRAW, value=name, span=span)
         if scope.pack:
             return None
-        # What belongs to no pack, such as a task, may leave out the pack of a parameter that only one has.
+        # Outside of packs, such as in a task, a parameter that only one pack has may be written without it.
         ends = [qualified for qualified in symbols.params if qualified.endswith(f".{name}")]
         if len(ends) != 1:
             return None
         return Expr("param", symbols.params[ends[0]].kind, value=ends[0], span=span)
 
     def is_new(self, name: Scalar | Syntax, scope: Scope) -> bool:
-        """True if a local name is new. Reports a reserved word, and a name that hides another one which its pack knows."""
+        """True if a local name is new. Reports reserved words, and names that hide one the pack can use."""
         names, word = self.symbols.names, name.text
         if not names.check_word(name, "anything"):
             return False
@@ -422,7 +424,7 @@ class Typer:
         if name in self.resolving:
             cycle = [*self.resolving[self.resolving.index(name) :], name]
             path = " -> ".join(f"`{set_name}`" for set_name in cycle)
-            message = f"the set `{name}` is defined by itself"
+            message = f"the set `{name}` is defined in terms of itself"
             raise self.fail("PD307", message, span, path, "list elements or tags")
         if len(self.resolving) >= MAX_SET_DEPTH:
             for waiting in self.resolving:
@@ -463,8 +465,8 @@ class Typer:
     def name(self, syntax: Syntax, scope: Scope) -> Operand:
         word, span = syntax.text, syntax.span
         if word in COORDINATES:
-            fix = f"write `{word} mod 2`: rules are the same everywhere and always, up to a pattern"
-            raise self.fail("PD406", f"`{word}` stands without `mod`", span, "endless by itself", fix)
+            fix = f"write `{word} mod 2`: rules may depend on place and time only periodically"
+            raise self.fail("PD406", f"`{word}` may only be used inside `mod`", span, "outside of `mod`", fix)
         if word in KERNEL_SHAPES and word not in KERNELS and self.find(word, span, scope) is None:
             label, fix = "its radius is missing", f"write `{word}(3)`"
             raise self.fail("PD406", f"`{word}` needs a radius", span, label, fix)
@@ -496,7 +498,7 @@ class Typer:
         if isinstance(base, Expr) and base.kind.name == "vec2":
             if syntax.text in ("row", "column"):
                 return Expr(f"{syntax.text}_part", REAL, (base,), span=syntax.span)
-            message, fix = f"a vector has no `{syntax.text}`", "parts of a vector: `.row`, `.column`"
+            message, fix = f"a vector does not have `{syntax.text}`", "parts of a vector: `.row`, `.column`"
             raise self.fail("PD301", message, word, "not a part of it", fix)
         if not isinstance(base, Place):
             raise self.wrong(base, "a neighbor before the dot", before.span, "such as `below.FIELD`")
@@ -521,9 +523,9 @@ class Typer:
         return self.symbols.names.known.get(qualified)
 
     def _is_own_word(self, word: Syntax, scope: Scope) -> bool:
-        """True if a word before a dot is a place, a vector or a name of its block, not the name of a pack.
+        """True if a word before a dot is a place, a vector or a local name, not the name of a pack.
 
-        Elements, tags and numbers have nothing after a dot: `salt.salt` is the element of the pack `salt`.
+        Elements, tags and numbers have no attributes: `salt.salt` is the element of the pack `salt`.
         """
         operand = self.find(word.text, word.span, Scope("", scope.locals, scope.orientation))
         return word.text in scope.locals or isinstance(operand, Place) or kind_name(operand) == "vec2"
@@ -537,13 +539,13 @@ class Typer:
             return Absent(missing.name)
 
     def without_mark(self, syntax: Syntax, scope: Scope) -> Syntax:
-        """An attribute without its question mark. Raises Unresolved if nothing that is loaded has its name."""
+        """An attribute without its question mark. Raises Unresolved if no loaded pack defines its name."""
         (before,) = syntax.children
         span = syntax.span
         if self._global_name(syntax) is None:
             if before.kind in ("name", "attribute"):
                 operand = self.find(before.text, before.span, scope)
-                if operand is None or isinstance(operand, SetOf):  # a pack that has an element of its name
+                if operand is None or isinstance(operand, SetOf):  # a pack with an element of its own name
                     raise Unresolved(f"{before.text}.{syntax.text}")
             if self.find(syntax.text, span, scope) is None:
                 raise Unresolved(syntax.text)
@@ -577,7 +579,7 @@ class Typer:
         return (disjunction if syntax.kind == "or_" else conjunction)(flags, syntax.span)
 
     def check_alternatives(self, syntax: Syntax, scope: Scope) -> None:
-        """Report `PLACE is A or B`, which reads as one test of a place: `B` alone is a test of the cell itself."""
+        """Report `PLACE is A or B`, which looks like one test of a place, although a bare `B` tests the cell itself."""
         choices = [syntax]
         while choices[0].kind == "or_":
             choices[:1] = choices[0].children
@@ -615,7 +617,7 @@ class Typer:
         for operand, child in zip(operands, syntax.children, strict=True):
             is_set = isinstance(operand, Items) or (isinstance(operand, SetOf) and operand.name is None)
             if is_set and not kinds.isdisjoint(("element", Place)):
-                # `below == fluid` would ask whether the two hold alike; what is meant is `below is fluid`.
+                # `below == fluid` would compare two conditions; `below is fluid` is meant.
                 fix = "write `is` or `is not` instead of `==` or `!=`"
                 raise self.wrong(operand, "one element to compare with", child.span, fix)
             if "direction" in kinds and isinstance(operand, (Place, PlaceChoice)):
@@ -647,14 +649,14 @@ class Typer:
         return (disjunction if syntax.kind == "any_of" else conjunction)(flags, syntax.span)
 
     def bindings(self, bindings: tuple[Syntax, ...], scope: Scope) -> list[Scope]:
-        """The scopes of a loop's rounds: the first variable changes slowest."""
+        """The scopes of a loop's iterations; the first variable changes slowest."""
         domains: dict[str, list[Operand]] = {}
         for binding in bindings:
             variable, domain = binding.children
             if not self.is_new(variable, scope.bind(**dict.fromkeys(domains, Broken()))):
                 raise Poisoned
             self.used.add(variable.text)
-            # A variable is turned where it is used, and only there.
+            # A variable is turned only where it is used.
             domains[variable.text] = self.domain(domain, replace(scope, orientation=IDENTITY))
         rounds = prod(len(domain) for domain in domains.values())
         if rounds > MAX_ROUNDS:
@@ -664,7 +666,7 @@ class Typer:
 
     def _too_long(self, rounds: int, span: Span, limit: str) -> Poisoned:
         label, fix = f"the limit is {limit}", "loop over fewer things"
-        return self.fail("PD508", f"a loop of {rounds:,} rounds", span, label, fix)
+        return self.fail("PD508", f"a loop of {rounds:,} iterations", span, label, fix)
 
     def domain(self, syntax: Syntax, scope: Scope) -> list[Operand]:
         operand = self.evaluate(syntax, scope)
@@ -685,7 +687,7 @@ class Typer:
         raise self.wrong(operand, "a range, a set or a list", syntax.span, fix)
 
     def chance_draw(self, stream: str, syntax: Syntax, scope: Scope) -> Expr:
-        """`with chance P`: a draw of the rule's own stream below P."""
+        """`with chance P`: a draw from the rule's own stream is below P."""
         span = syntax.span
         threshold = self.of_kind(self.evaluate(syntax, scope), CHANCE, span)
         draw = Expr("draw", DRAW, value=stream, span=span)
@@ -696,14 +698,14 @@ def _integer_helps(value: Expr, span: Span) -> tuple[str, ...]:
     """The fix for a float where an integer is needed."""
     if value.kind.name != "real":
         return ()
-    declared = "or declare what takes it as `real(LOW..HIGH)`"
+    declared = "or declare the target as `real(LOW..HIGH)`"
     if all(arg.op in ("to_real", "const") for arg in value.args):
         if quotient := re.fullmatch(r"([^/]+?) */ *([^/]+)", span.text):
             return (f"integer division rounds down: `{quotient[1]} div {quotient[2]}`", declared)
         if scaled := re.fullmatch(r"([^*]+?) *[*] *([0-9]*[.][0-9]+)", span.text):
             ratio = Fraction(scaled[2])
             times = f" * {ratio.numerator}" if ratio.numerator > 1 else ""
-            return (f"integers stay whole: `{scaled[1]}{times} div {ratio.denominator}`", declared)
+            return (f"write it with integers: `{scaled[1]}{times} div {ratio.denominator}`", declared)
     return ("`a div b` divides integers and rounds down", declared)
 
 
@@ -723,4 +725,4 @@ HANDLERS: dict[str, Callable[[Typer, Syntax, Scope], Operand]] = {
     **dict.fromkeys(("add", "sub", "mul", "div", "quotient", "neg"), calculation),
     "mod": modulo,
 }
-"""By kind of syntax node, the function that evaluates an expression with parts."""
+"""The function that evaluates each kind of syntax node with parts."""

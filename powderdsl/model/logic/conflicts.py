@@ -1,4 +1,4 @@
-"""The logic of rules, decided before anything runs: collisions, clashing writes, rules that never fire."""
+"""Static checks of rules: collisions, conflicting writes, rules that never fire."""
 
 from __future__ import annotations
 
@@ -56,18 +56,18 @@ if TYPE_CHECKING:
     from powderdsl.model.elaborate import Elaborator
 
 COMPARISONS = 1_000_000
-"""Work for comparing the rules of all substeps, in nodes: a second."""
+"""Work for comparing the rules of all substeps, in nodes: about a second."""
 
 GLANCE = 3
 """The cost of a comparison of two rules, in nodes."""
 
 MAX_PARTS = 64
-"""The most parts of a condition that follows from a value; a longer one is dropped, which stays correct."""
+"""Maximum number of parts of a condition derived from a value; dropping a longer one is still correct."""
 
 
 @dataclass(frozen=True)
 class Conflict:
-    """Two rules (or two copies of one) that may claim one cell. Rounds of a loop repeat it, so it is a value.
+    """Two rules (or two copies of one) that may claim one cell. It is a value, since iterations of a loop repeat it.
 
     `first` and `second` are the spans of the rules without their conditions; it is reported at the second.
     """
@@ -81,12 +81,12 @@ class Conflict:
     assigns: bool = False
 
     def report(self, labels: list[str], example: str, reporter: Reporter) -> None:
-        """Report it once for all rounds that have it. `example` is for the first of them."""
+        """Report it once for all iterations. `example` is for the first one."""
         where = f" ({labels[0]})" if labels[0] else ""
         notes = [*filter(None, [example]), *self.notes]
         if len(labels) > 1:
             more = "1 more copy" if len(labels) == 2 else f"{len(labels) - 1} more copies"
-            notes.append(f"the same in {more} of the rule that its loop or symmetry makes")
+            notes.append(f"the same applies to {more} of the rule, made by its loop or symmetry")
         is_same = self.first == self.second
         reporter.error(
             self.code, self.message + where, self.second, "two of these can overlap" if is_same else "claims it too",
@@ -96,23 +96,21 @@ class Conflict:
     def report_added(
         self, causes: Sequence[Cause], pass_name: str, example: str, settled: bool, reporter: Reporter
     ) -> None:
-        """Reports the conflict at what added packs do to cause it: a warning if `settled`, because one rule wins."""
+        """Report the conflict at its cause in added packs, as a warning if it is `settled`, so that one rule wins."""
         first, *more = causes
         secondary = [Label(cause.span, "and this") for cause in more]
         secondary.append(Label(self.first, "claims the cell"))
         if self.second != self.first:
             secondary.append(Label(self.second, "claims it too"))
         words = " or ".join(dict.fromkeys(f"`{cause.span.text}`" for cause in causes))
-        helps = [
-            f"leave out {words} here, or see to it that the element meets the conditions of one rule only"
-        ]
+        helps = [f"remove {words} here, or make sure that the element meets the conditions of only one rule"]
         notes = [example] if example else []
         if not settled:
             helps.append(f"or ask the author of `{pass_name}` for a policy, such as `conflicts: first_wins`")
         elif self.assigns:
-            notes.append("the assignment that stands last holds")
+            notes.append("the last assignment wins")
         else:
-            notes.append("the rule that stands first holds, as with `conflicts: first_wins`")
+            notes.append("the first rule wins, as with `conflicts: first_wins`")
         message = f"`{first.pack}` {first.does}: two rules of `{pass_name}` may claim one cell with it"
         reporter.report(
             "PD517" if settled else self.code, message, first.span, "because of this",
@@ -128,7 +126,7 @@ def _claim(rule: Rule) -> Span:
 
 
 Conflicts = dict[Conflict, tuple[dict[Offset, int], list[tuple[int, int]]]]
-"""Conflicts with an example of each, and where they were met: passes and substeps by number."""
+"""Conflicts with an example of each, and their locations: passes and substeps by number."""
 
 
 def check_logic(
@@ -176,8 +174,8 @@ def check_logic(
         message = f"comparing the rules of `{longest.name}` with each other takes too much work"
         label = f"{count:,} rules in one list are {count * (count + 1) // 2:,} pairs"
         helps = [
-            "choose what happens to conflicts, then nothing is compared: `conflicts: first_wins`",
-            "or divide the list until its parts are short enough: rules that need not happen at once go under `then:`",
+            "choose the outcome of conflicts, so that nothing is compared: `conflicts: first_wins`",
+            "or split the list: move rules that need not fire in the same substep under `then:`",
         ]
         reporter.error("PD508", message, longest.span, label, helps=helps)
         return passes, []
@@ -185,7 +183,7 @@ def check_logic(
         passes = _report_conflicts(conflicts, passes, facts, added, reporter)
     for span in useful.where(False):
         if fires[span]:
-            label = "the cell already holds that element"
+            label = "the cell already has that element"
             fix = "remove it, or name another element after `->`"
             reporter.report("PD509", "this rule changes nothing", span, label, helps=[fix])
         else:
@@ -203,12 +201,12 @@ def _report_silent(
     elif span in elaborated.empty:
         reason = f"no element is in `{elaborated.empty[span]}`"
     elif any(decide(relaxed, [(mask, HERE)], lets) for mask, lets in copies):
-        reason = "no loaded element has the properties it asks for"
+        reason = "no loaded element has the properties that it needs"
     else:
         _report_impossible(span, copies[0], facts, reporter)
         return
-    label = "cannot happen with these packs"
-    fix = "it becomes active with a pack that brings what it asks for"
+    label = "cannot fire with these packs"
+    fix = "it becomes active with a pack that provides them"
     reporter.report("PD506", f"this rule is inactive: {reason}", span, label, helps=[fix])
 
 
@@ -223,7 +221,7 @@ def _report_impossible(span: Span, copy: tuple[Expr, Lets], facts: Facts, report
         if others and decide(facts, [(other, HERE) for other in others], lets) is False:
             parts = others
     notes = [
-        f"`{one_line(arg.span)}` lies in {arg.kind.lo:g}..{arg.kind.hi:g}"
+        f"`{one_line(arg.span)}` is in {arg.kind.lo:g}..{arg.kind.hi:g}"
         for part in parts
         for arg in part.args
         if part.op in ("lt", "le", "eq")
@@ -240,14 +238,14 @@ def _report_impossible(span: Span, copy: tuple[Expr, Lets], facts: Facts, report
         "no cell can meet all of its conditions",
         secondary=[Label(place, label) for place in places if place != span],
         notes=notes,
-        helps=["change the conditions that are underlined, or remove the rule"],
+        helps=["change the underlined conditions, or remove the rule"],
     )
 
 
 def _report_conflicts(
     conflicts: Conflicts, passes: tuple[Pass, ...], facts: Facts, added: AddedPacks | None, reporter: Reporter
 ) -> tuple[Pass, ...]:
-    """Report conflicts; the passes with those resolved that added packs bring about."""
+    """Report conflicts; return the passes with those caused by added packs resolved."""
     resolved: set[tuple[int, int]] = set()
     for conflict, (elements, places) in conflicts.items():
         words = _example_text(facts, elements)
@@ -270,7 +268,7 @@ def _report_conflicts(
 
 
 def _allows_first_wins(moment: Moment) -> bool:
-    """True if `first_wins` changes nothing where no two rules meet.
+    """True if `first_wins` changes nothing where no two rules conflict.
 
     Without the policy, moves may go where another one leaves, and transforms into one element may all have their
     effects.
@@ -302,7 +300,7 @@ def _check_substep(
 def _conflicts_of(
     rules: Sequence[tuple[Rule, Expr]], facts: Facts, lets: Lets
 ) -> Iterator[tuple[Conflict, dict[Offset, int]]]:
-    """The conflict of each rule with the first rule, maybe itself, with which it may claim one cell.
+    """The conflict of each rule with the first rule, possibly itself, with which it may claim the same cell.
 
     Rules come with their conditions. Each conflict has an example of elements by place.
     """
@@ -327,9 +325,9 @@ def _conflicts_of(
                 undecided = first
         else:
             if undecided is not None and facts.budget.left >= 0:
-                # That their conditions exclude each other would not help.
-                note = "their conditions combine too many values to decide whether they can meet"
-                choice = "choose what happens if they do: `conflicts: first_wins`"
+                # Mutually exclusive conditions would not help.
+                note = "their conditions combine too many values to decide whether both can hold"
+                choice = "choose the outcome if they can: `conflicts: first_wins`"
                 helps = (choice, "or put one of them under `then:`")
                 yield replace(_conflict(undecided, second), notes=(note,), helps=helps), {}
 
@@ -338,7 +336,7 @@ _PLACES = {(0, 0): "here", (-1, 0): "above", (1, 0): "below", (0, -1): "on the l
 
 
 def _example_text(facts: Facts, elements: dict[Offset, int]) -> str:
-    """An example of elements where two rules meet, such as `x` here and `y` below."""
+    """An example of elements for which two rules conflict, such as `x` here and `y` below."""
     names = [(at, facts.names[number]) for at, number in sorted(elements.items()) if number in facts.names]
     if not names or len(elements) > 4:
         return ""
@@ -359,7 +357,7 @@ def _claim_offsets(first: Rule, second: Rule) -> Iterator[Offset]:
             yield HERE
         return
     if isinstance(first, Move) and isinstance(second, Move):
-        # A move into a place that is being left is fine: what stands there goes first.
+        # A move into a place that is being left is fine: its contents leave first.
         if first is not second:
             yield HERE
             yield minus(first.offset, second.offset)
@@ -381,7 +379,7 @@ def _conflict(first: Rule, second: Rule) -> Conflict:
     if first is second or first.span == second.span:
         message = "a cell may be both mover and target"
         note = "the moves of one substep happen at once: no cell may take part in two of them"
-        fix = "add a condition that a target cannot meet, such as a comparison of densities"
+        fix = "add a condition that targets cannot meet, such as a comparison of densities"
         helps = (fix, "or choose a policy: `conflicts: drop_both`")
         return Conflict("PD501", message, here, here, (note,), helps)
     code = "PD501" if isinstance(first, (Swap, Move)) or isinstance(second, (Swap, Move)) else "PD502"
@@ -391,7 +389,7 @@ def _conflict(first: Rule, second: Rule) -> Conflict:
 
 
 def _suggest_side_multiple(conflict: Conflict, question: Conditions, facts: Facts, lets: Lets) -> Conflict:
-    """The conflict with the fix for rules that alternate by row or column: worlds without a seam keep them apart."""
+    """The conflict with the fix for rules that alternate by row or column, which only meet at a seam of the world."""
     exprs = [*(condition for condition, _ in question), *lets.values()]
     nodes = [node for expr in exprs for node in expr.walk()]
     moduli = [node.value[1] for node in nodes if node.op == "coordinate" and node.value[0] != "step"]
@@ -407,7 +405,7 @@ def _suggest_side_multiple(conflict: Conflict, question: Conditions, facts: Fact
 
 
 Domains = dict[tuple[int, Offset], frozenset[object]]
-"""The values that a condition leaves of single variables, by number and place: elements, fields and counts."""
+"""The values of single variables (elements, fields and counts) that a condition allows, by number and place."""
 
 
 def _domains(masks: Iterable[Expr], facts: Facts, lets: Lets) -> Iterator[Domains]:
@@ -421,7 +419,7 @@ def _domains(masks: Iterable[Expr], facts: Facts, lets: Lets) -> Iterator[Domain
 
 
 def _are_disjoint(first: Domains, second: Domains, at: Offset, budget: Budget) -> bool:
-    """True if the first condition and, `at` away from it, the second leave no common value of some variable."""
+    """True if the first condition and the second one, `at` away, allow no common value of some variable."""
     budget.left -= GLANCE
     for (number, place), values in second.items():
         known = first.get((number, plus(place, at)))
@@ -448,7 +446,7 @@ def flags_for_later(lets: Lets) -> Lets:
 
 
 def _follows(expr: Expr, follow: Lets) -> Expr:
-    """A condition on coordinates alone that holds wherever the expression does. `follow` has those of earlier values."""
+    """A condition on coordinates alone that the expression implies. `follow` has those of earlier values."""
     if all(node.op in _COORDINATES for node in expr.walk()):
         return expr
     match expr.op:

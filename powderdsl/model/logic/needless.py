@@ -1,8 +1,8 @@
-"""Warnings about rules and definitions that decide nothing: comparisons with one outcome, rules that others always
-overrule, writes that no cell keeps, chances and names that nothing uses.
+"""Warnings about rules and definitions without effect: comparisons with one outcome, rules that are always overruled,
+lost writes, unused chances and names.
 
-Rules are legal with these, so they are warnings. Loops and symmetries write a rule out many times: a warning is
-given only if all its copies deserve it.
+Such rules are legal, so these are warnings. Loops and symmetries make many copies of a rule: a warning is given only if
+it applies to all of them.
 """
 
 from __future__ import annotations
@@ -45,14 +45,13 @@ if TYPE_CHECKING:
     from powderdsl.model.expressions.typer import Typer
 
 BUDGET = 100_000
-"""Nodes evaluated for each kind of these warnings: a quarter of a second. After that nothing more is found, and a note
-reports it."""
+"""Nodes evaluated for each kind of these warnings, about a quarter of a second. The rest is reported by a note."""
 
 GLANCES = 10
-"""Rules of a substep that are looked at for the work of one node."""
+"""Rules of a substep that count as the work of one node."""
 
 MAX_LISTED = 20
-"""Rules that are named; the others are counted."""
+"""Maximum number of rules to list; the others are counted."""
 
 SILENT = ("PD503", "PD506", "PD509")
 """Rules already reported with these codes get no second warning."""
@@ -63,7 +62,7 @@ def report_needless(
 ) -> list[Span]:
     """Report comparisons that ranges decide, rules that others always overrule, and writes that are always lost.
 
-    Returns the rules and writes that may have no effect, which takes too much work to decide.
+    Returns the rules and writes for which deciding takes too much work.
     """
     silent = [d.primary.span for d in reporter.diagnostics if d.code in SILENT and d.primary.span]
     _report_decided(passes, silent, reporter)
@@ -99,7 +98,7 @@ def _report_decided(passes: tuple[Pass, ...], silent: Sequence[Span], reporter: 
         if known in ({(True, True)}, {(False, False)}) and not _inside_any(span, silent):
             reporter.report(
                 "PD513", "this comparison decides nothing", span, "its result is the same in every world",
-                helps=["look at the bounds of both sides", "remove it, if it is meant so"],
+                helps=["check the bounds of both sides", "remove it if this is intended"],
             )  # fmt: skip
 
 
@@ -113,13 +112,13 @@ def _parts(rules: Iterable[Rule]) -> Iterator[Expr]:
 
 
 def report_repeated(children: Sequence[Syntax], reporter: Reporter) -> None:
-    """Report that parts of a condition, a comparison or a choice are the same words twice."""
+    """Report that a condition, a comparison or a choice has the same part twice."""
     texts = [" ".join(child.span.text.split()) for child in children]
     for number, child in enumerate(children):
         if texts[number] in texts[:number]:
             reporter.report(
-                "PD513", "the same is said twice", child.span, "this stands there already",
-                helps=["look for a word that should be another one", "remove it, if it is meant so"],
+                "PD513", "this part is repeated", child.span, "it is already here",
+                helps=["check whether one of them should differ", "remove it if this is intended"],
             )  # fmt: skip
 
 
@@ -141,7 +140,7 @@ def _report_overruled(
     for span in matters.where(False):
         if not _inside_any(span, silent):
             winner = winners[span]
-            words = "writes over it, always" if isinstance(winner, Assign) else "always comes before it"
+            words = "always overwrites it" if isinstance(winner, Assign) else "always comes before it"
             reporter.report(
                 "PD514", "this rule is always overruled", span, "it has no effect",
                 secondary=[Label(winner.span, words)],
@@ -162,7 +161,7 @@ def _may_matter(rule: Rule, rivals: Sequence[Rule], moment: Moment, facts: Facts
 
 
 def _rivals(rule: Rule, place: int, moment: Moment) -> list[Rule]:
-    """The rules of a substep that overrule a rule wherever they happen."""
+    """The rules of a substep that overrule a rule wherever they fire."""
     rivals: list[Rule] = []
     for number, other in enumerate(moment.rules):
         earlier = number < place
@@ -185,10 +184,9 @@ def _rivals(rule: Rule, place: int, moment: Moment) -> list[Rule]:
 def report_undrawn(
     ruleset: Ruleset, element_values: Sequence[tuple[str, int, Span]], facts: Facts, reporter: Reporter
 ) -> list[Span]:
-    """Report chances of elements against which no rule draws there: mostly a tag is missing.
+    """Report chances of elements that no rule ever draws there, usually because a tag is missing.
 
-    Element values are property, element id, and span. Returns the chances that perhaps no rule draws, which takes too
-    much work to decide.
+    Element values are property, element id, and span. Returns the chances for which deciding takes too much work.
     """
     quick = _limited(facts)
     undecided = []
@@ -203,14 +201,14 @@ def report_undrawn(
         elif not drawn:
             element = facts.names.get(number, "?")
             reporter.report(
-                "PD507", f"`{name}` of `{element}` is never used", span, f"no rule asks `{element}` for it",
-                helps=["look for a tag that it lacks, or remove the value"],
+                "PD507", f"`{name}` of `{element}` is never used", span, f"no rule draws it for `{element}`",
+                helps=["check whether the element lacks a tag, or remove the value"],
             )  # fmt: skip
     return undecided
 
 
 def _may_draw(name: str, number: int, ruleset: Ruleset, facts: Facts) -> Iterator[bool | None]:
-    """For each rule that reads the property: may it happen where this element is?"""
+    """For each rule that reads the property, whether it can fire where this element is."""
     for pass_ in ruleset.passes:
         everywhere = {let.name: let.value for moment in pass_.moments for let in moment.lets}
         for moment in pass_.moments:
@@ -260,8 +258,8 @@ def _report_lost_writes(
                     arrives.add(key, _may_land(write, rule, tuple(sorted(field.of)), moment, facts))
     for span, name in arrives.where(False):
         reporter.report(
-            "PD516", f"this write to `{name}` is always lost", span, f"no cell that it reaches has a `{name}`",
-            secondary=[Label(fields[name].span, "`of:` says which elements have it")],
+            "PD516", f"this write to `{name}` is always lost", span, f"no target cell has a `{name}`",
+            secondary=[Label(fields[name].span, "`of:` lists the elements that have it")],
             helps=["widen `of:`, or write to a cell that holds one of its elements"],
         )  # fmt: skip
     return [span for span, _ in arrives.where(None)]
@@ -278,7 +276,7 @@ def _may_land(write: Assign, rule: Rule, ids: tuple[int, ...], moment: Moment, f
         landing = [stays]
     elif brought is not None and not (isinstance(rule, Move) and write.offset == HERE):
         landing = [(rule.mask, brought)]
-    else:  # other rules may bring something there, also to the place that a move leaves
+    else:  # other rules may bring an element there, also to the place that a move leaves
         landing = [(other.mask, what) for other in moment.rules for what in _brings(other).values()]
         landing += [stays] if brought is None else []
     return some(
@@ -316,8 +314,8 @@ def report_undecided(spans: Iterable[Span], reporter: Reporter) -> None:
         "PD518", f"it takes too much work to decide whether these lines have any effect: {words}{more}", listed[0],
         "its conditions combine too many values",
         secondary=[Label(span, "this too") for span in listed[1:]],
-        notes=["nothing wrong was found; warnings about them, such as PD503 and PD514, may be missing"],
-        helps=["`powderdsl test` lists the rules that never happen; a test of your own shows what one does"],
+        notes=["no mistake was found; warnings about them, such as PD503 and PD514, may be missing"],
+        helps=["`powderdsl test` lists the rules that never fire; you can also write a test for a rule"],
     )  # fmt: skip
 
 
@@ -351,7 +349,7 @@ def _unused(what: str, name: str, span: Span, reporter: Reporter) -> None:
 
 
 def _report_unwritten(composition: Composition, reporter: Reporter) -> None:
-    """Report fields and values under `let` whose names stand in no rule, not even in one that is inactive.
+    """Report fields and values under `let` whose names are in no rule, not even an inactive one.
 
     Tasks and programs may read a field that a ruleset lists as a channel. Streams and tags are left out: packs declare
     them for others.
@@ -380,7 +378,7 @@ def _report_unwritten(composition: Composition, reporter: Reporter) -> None:
 def overridden_ids(passes: tuple[Pass, ...], names: Sequence[str], facts: Facts) -> dict[str, frozenset[int]]:
     """The ids, by property, whose cells may hold their own value: those that some rule assigns it to.
 
-    A value of its own may fulfill the condition of another such rule, so this continues until nothing is added.
+    A cell's own value may meet the condition of another such rule, so this repeats until nothing is added.
     """
     writes: list[tuple[Assign, Lets]] = []
     for _, moment in substeps(passes):
@@ -401,7 +399,7 @@ def overridden_ids(passes: tuple[Pass, ...], names: Sequence[str], facts: Facts)
 
 
 def without_dead_overrides(passes: tuple[Pass, ...], dead: frozenset[str]) -> tuple[Pass, ...]:
-    """The passes without assignments to properties that no cell can override: these properties are not stored."""
+    """The passes without assignments to properties that no cell can override, which are not stored."""
 
     def alive(moment: Moment) -> Moment:
         rules = [r for r in moment.rules if not (isinstance(r, Assign) and r.field in dead)]

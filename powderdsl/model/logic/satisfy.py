@@ -1,6 +1,6 @@
 """Can these conditions hold at once? A small constraint search over elements, properties, fields, counts and draws.
 
-The answer errs to one side only: False is a proof, True may mean "could not decide". The search cannot enumerate float
+The answer errs on one side only: False is a proof, True may mean "could not decide". The search cannot enumerate float
 comparisons, parameters and large ranges: it treats them as free, the same expression at the same place once.
 """
 
@@ -26,13 +26,13 @@ Conditions = Sequence[tuple[Expr, Offset]]
 
 MAX_DOMAIN = 256
 MAX_LET = 150
-"""Nodes of a let's value that are looked through; a larger one is taken for free."""
+"""Maximum number of nodes of a let's value; a larger one is treated as free."""
 
 BUDGET = 500_000
-"""Nodes evaluated in a group of questions: half a second. The largest shipped ruleset needs a twentieth of it."""
+"""Nodes evaluated in a group of questions, about half a second. The largest shipped ruleset needs a twentieth."""
 
 MAX_QUESTION = 100_000
-"""Nodes evaluated for one question. A harder one stays undecided, and the others keep their share."""
+"""Nodes evaluated for one question. A harder one stays undecided, so that the others keep their share."""
 
 QUESTION = 60
 """The cost of a question besides its evaluations."""
@@ -44,14 +44,14 @@ class _Exhausted(Exception):
 
 @dataclass
 class Budget:
-    """Work that is left for some questions, counted in nodes: the same on every machine, in every order."""
+    """The remaining work for some questions, counted in nodes, so that it is the same on every machine."""
 
     left: int = BUDGET
     most: int = MAX_QUESTION
     """For one question."""
 
     def spend(self, nodes: int) -> None:
-        """Take work from what is left. Raises _Exhausted if there is too little."""
+        """Subtract work from the rest. Raises _Exhausted if too little is left."""
         self.left -= nodes
         if self.left < 0:
             raise _Exhausted
@@ -90,7 +90,7 @@ class Facts:
 def decide(facts: Facts, conditions: Conditions, lets: Lets | None = None) -> bool | None:
     """True if the conditions may hold together; None if deciding takes too much work. False is a proof."""
     if lets and _answer(facts, conditions, None, _Search.possible) is False:
-        return False  # whatever the values of lets are
+        return False  # for any values of lets
     return _answer(facts, conditions, lets, _Search.possible)
 
 
@@ -128,7 +128,7 @@ def single_domains(facts: Facts, condition: Expr, lets: Lets) -> dict[Variable, 
 
 
 def example(facts: Facts, conditions: Conditions, lets: Lets) -> dict[Offset, int]:
-    """Elements by place with which the conditions hold together, or nothing if none are found."""
+    """Elements by place for which the conditions hold together; empty if none are found."""
     return _ask(facts, conditions, lets, _Search.example) or {}
 
 
@@ -249,7 +249,7 @@ class _Search:
         }
 
     def example(self) -> dict[Offset, int]:
-        """An element for each place that the conditions ask about, with which they hold."""
+        """An element for each place that the conditions read, for which they hold."""
         if not self.possible():
             return {}
         elements = [key for key in self._domains if self._names[key][0] == "element"]
@@ -269,7 +269,7 @@ class _Search:
         return True
 
     def _assign(self, keys: list[int], joint: list[_Term]) -> bool:
-        """Choose values of variables, one after the other, with which the conditions may hold.
+        """Choose values of variables, one after another, for which the conditions may hold.
 
         Each choice is checked at once against the bounds of all conditions that read the variable (backtracking).
         """
@@ -338,8 +338,8 @@ class _Search:
                 keys = [self._key("element", None, at), self._key("value", node, at)]
                 return _Term("field", node, tuple(keys), about=about)
             case "coordinate":
-                # The step is the same everywhere. A row or column is known from that of another place if no seam comes
-                # between: where the sides of the world are multiples of its modulus. Elsewhere it is free everywhere.
+                # The step is the same everywhere. A row or column follows from that of another place unless a seam may
+                # be between: if the sides of the world are multiples of its modulus. Otherwise, it is free everywhere.
                 axis, modulus = node.value
                 if axis == "step":
                     return self._variable(node, "value", node, HERE)
@@ -382,7 +382,7 @@ class _Search:
 
     def _bounds(self, term: _Term) -> Bounds:
         """The bounds of a value for those of the variables; a flag's are 0 and 1."""
-        self.budget.left -= 1  # `spend` written out: this is where the time goes
+        self.budget.left -= 1  # `spend` inlined, since most time is spent here
         if self.budget.left < 0:
             raise _Exhausted
         op, node, keys, args, about = term

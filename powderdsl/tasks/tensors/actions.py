@@ -1,4 +1,4 @@
-"""Actions on tensors: blocks of cells filled with an element, or blown."""
+"""Actions on tensors: filling blocks of cells with an element, or blowing."""
 
 from __future__ import annotations
 
@@ -15,11 +15,10 @@ from powderdsl.tasks.task import BLOW, Agent
 from powderdsl.worlds.raster import Size
 
 CLOCK = ("seed", "index", "step")
-"""Tensors of `World` that draws depend on."""
+"""Tensors of `World` that determine draws."""
 
 Numbers = Any
-"""int64 [B]: tensors, or for packed worlds NumPy's arrays, which start an operation on a few numbers in a fraction of
-the time."""
+"""int64 [B]: tensors, or for packed worlds NumPy arrays, which have less overhead."""
 
 
 def take_worlds(world: World, places: Tensor) -> World:
@@ -76,9 +75,9 @@ class Blocks:
             width = torch.arange(int((end - first).max()), device=sim.device)
             self._lines.append(torch.minimum(first + width, end - 1))
         self.tables = {slot.name: sim.fresh_values(slot) for slot in sim.slots}
-        """What a new cell holds, by id: [256] or, of vectors, [256, 2]."""
+        """The values of a new cell, by id: [256] or, for vectors, [256, 2]."""
         self.fresh = {slot.name: self.tables[slot.name] for slot in sim.slots if slot.travels}
-        """The same of what a cell's element brings along."""
+        """The same for values that travel with the element."""
         self._arrays = {name: table.cpu().numpy() for name, table in self.fresh.items()}
         self._edges = [axis.cpu().numpy() for axis in edges]
 
@@ -99,8 +98,8 @@ class Blocks:
     ) -> Mapping[str, Tensor]:
         """A state with blocks, which `cells` gave, filled in the worlds of `where`, bool [B].
 
-        There is a value a world, [B] or [B, 2]. All are arrays for a packed state, and tensors for others. `reuse` writes
-        into the tensors of `state`.
+        There is one value per world, [B] or [B, 2]. All are arrays for a packed state, and tensors for others. `reuse`
+        overwrites the tensors of `state`.
         """
         if isinstance(state, PackedState):  # only the blocks are written, nothing is unpacked
             numbers = {
@@ -121,10 +120,10 @@ class Blocks:
 
 
 class Hands:
-    """An agent's hands on the worlds of one simulator and size."""
+    """Applies an agent's actions to the worlds of one simulator and size."""
 
     def __init__(self, sim: Simulator, agent: Agent, size: Size, *, counts: bool):
-        """`counts`: whether the cells that actions change are counted."""
+        """`counts`: count the cells that actions change."""
         self.agent, self.size, self.device, self.counts = agent, size, sim.device, counts
         edges = []
         for axis, side in enumerate(size):
@@ -139,10 +138,10 @@ class Hands:
             for name, table in self.blocks.tables.items()
             if name != "element"
         }
-        """What new cells hold, and whether it is the same for all elements: looking ids up takes 20 times as long."""
+        """The values of new cells, and whether all elements share them, since looking up ids takes 20 times as long."""
 
     def fresh_state(self, ids: Tensor, *, shares: bool = False) -> dict[str, Tensor]:
-        """The state of new worlds of ids, uint8 [B, H, W]. `shares`: what all cells hold may be there once, to be read."""
+        """The state of new worlds of ids, uint8 [B, H, W]. `shares`: store a value of all cells once, read-only."""
         index, state = ids.int(), {"element": ids}
         for name, (table, same) in self._fresh.items():
             cells = table[0].expand(*ids.shape, *table.shape[1:]) if same else table[index]
@@ -153,7 +152,7 @@ class Hands:
         return state
 
     def act(self, world: World, actions: Tensor, *, reuse: bool) -> tuple[World, dict[str, Tensor]]:
-        """The worlds after actions, int64 [B, 5], within their bounds. `reuse` writes into the world's own tensors.
+        """The worlds after actions, int64 [B, 5], within bounds. `reuse` overwrites the world's own tensors.
 
         Beside them, int64 [B] each: the number of cells ``painted``, and 1 if an element was ``placed``, or cells were
         ``blown``.
@@ -171,7 +170,7 @@ class Hands:
             if before is not None:
                 painted = (before != state["element"]).sum((1, 2))
         if self.agent.speed_field is not None:
-            # Directions are −1, 0 and 1, so that products in double precision are exact.
+            # Directions are −1, 0 and 1, so products in double precision are exact.
             speed = self.agent.speed * (numbers[:, [4, 3]] - 1)
             speed = speed.astype(np.float32) if packed else speed.float()
             values = {self.agent.speed_field: speed}

@@ -1,7 +1,7 @@
-"""Generators: seeds in, worlds out, no loop over worlds. On tensors, or on arrays without torch.
+"""Generators from seeds to worlds, without a loop over worlds, on tensors or on arrays without torch.
 
-Every number that a world draws is a hash of its seed, the statement, the repetition and which number of the statement
-it is. So a world is the same alone and in any batch, on any device.
+Every number that a world draws is a hash of its seed, the statement, the repetition and the number's index in the
+statement. So a world is the same in any batch and on any device.
 """
 
 from __future__ import annotations
@@ -49,22 +49,22 @@ def _row_type(kind: ArrayKind, size: Size) -> Any:
 
 @cache
 def _row_numbers(kind: ArrayKind, size: Size) -> Array:
-    """The row of each cell: [H, W] in C order, as bytes if they fit, of which many are compared at a time."""
+    """The row of each cell: [H, W] in C order, as bytes if they fit, since many bytes are compared at a time."""
     row = kind.xp.asarray(kind.arange(size[0]), dtype=_row_type(kind, size))
     return kind.copied(kind.xp.broadcast_to(row[:, None], size))
 
 
 def cells_between(kind: ArrayKind, first: Array, count: Array, size: Size) -> Array:
-    """The cells of rows, as `shape_rows` gives them: bool [..., H, W]."""
+    """The cells of rows returned by `shape_rows`: bool [..., H, W]."""
     row = _row_numbers(kind, size) - first[..., None, :]
     return (row if size[0] < 256 else row & MASK) < count[..., None, :]  # rows above have large numbers
 
 
 CHUNK_CELLS = 1 << 18
-"""Cells of the worlds that are made together on the CPU: they fit its cache."""
+"""Number of cells of worlds to make together on the CPU, which fit its cache."""
 
 CHANCE_BITS = 16
-"""Scattered cells are drawn with that many bits: chances are multiples of 2⁻¹⁶."""
+"""Bits of draws of scattered cells: chances are multiples of 2⁻¹⁶."""
 
 _NUMBERS, _STATEMENT, _COUNTER, _INDEX = 128, 0x9E3779B1, 0x85EBCA6B, 0x7A51
 """Draws of one statement and repetition; odd factors that spread counters; the worlds' index of `base_keys`, which
@@ -72,14 +72,14 @@ keeps draws of generators apart from those of rules."""
 
 
 _WITHOUT_ROWS = ("scatter", "stamp")
-"""Statements whose cells are found only when they are painted."""
+"""Statements whose cells are computed only when they are painted."""
 
 
 @dataclass(frozen=True)
 class Made:
     """Generated worlds: ids uint8 [B, H, W]; regions bool [B, H, W] or [1, H, W]; targets uint8 [B, H, W].
 
-    `fields` has the values that are set, [B, H, W] or [B, 2, H, W], and the cells that have them, bool [B, H, W].
+    `fields` has the values set, [B, H, W] or [B, 2, H, W], and their cells, bool [B, H, W].
     """
 
     ids: Array
@@ -127,7 +127,7 @@ _CALCULATE: dict[str, Callable[..., Any]] = {
 
 
 class _Draws:
-    """The amounts of one statement, and one of some `choices` before them: each draw takes the next counter.
+    """The amounts of one statement, after one of some `choices`; each draw takes the next counter.
 
     `arrays` are int64 that broadcast to [B, R] for R repetitions, None for None; so is `choice`, None if there is but one.
     """
@@ -154,7 +154,7 @@ class _Draws:
         self.arrays = [kind.put(value, "int64") if isinstance(value, int) else value for value in values]
 
     def uniform(self, low: Array | int, high: Array | int) -> Array:
-        """Integers from `low` to `high`, both included; where there are none, `low`."""
+        """Integers from `low` to `high`, inclusive; `low` if there are none."""
         return low + ((next(self.drawn) * (high - low + 1)) >> 32)
 
     def value(self, amount: Expr) -> Array | int:
@@ -172,7 +172,7 @@ class _Draws:
 
 
 class WorldMaker:
-    """A generator made executable for one size and kind of arrays. `slots` are the fields that worlds set."""
+    """An executable generator for one size and kind of arrays. `slots` are the fields that worlds set."""
 
     def __init__(self, generator: Generator, size: Size, kind: ArrayKind, slots: Sequence[Slot] = ()):
         self.generator, self.size, self.kind, self.slots = generator, size, kind, slots
@@ -260,7 +260,7 @@ class WorldMaker:
             assert count is not None
             repeats = group.most
             if self.kind.on_cpu and repeats > 1:
-                # Repetitions that no world of the batch has are not drawn.
+                # Skip repetitions that no world of the batch has.
                 repeats = int(count.max()) if prod(count.shape) else 0
             if repeats == 0:
                 continue
@@ -274,12 +274,12 @@ class WorldMaker:
 
 
 class _Painter:
-    """One statement in all its repetitions: what it needs is computed for all of them at once."""
+    """One statement in all its repetitions, whose inputs are computed at once."""
 
     def __init__(
         self, maker: WorldMaker, drawing: Drawing, hashes: Hashes, names: Mapping[str, Array], active: Array
     ):
-        """`active`: bool [B, R], whether a world has a repetition."""
+        """`active`: bool [B, R], the repetitions of each world."""
         self.maker, self.drawing, self.hashes = maker, drawing, hashes
         kind, xp, shape = maker.kind, maker.kind.xp, tuple(active.shape)
         self.active = xp.asarray(active, dtype=xp.uint8)
@@ -317,7 +317,7 @@ class _Painter:
             self._set_fields(ids, cells & (self.active[:, repeat, None, None] != 0), fields)
         if drawing.value is not None:
             return ids
-        # Bits of bytes, which are changed many at a time; `where` takes 15 times as long.
+        # Bit operations on bytes, many at a time; `where` takes 15 times as long.
         changed = (ids ^ painted) * cells
         if drawing.kind in _WITHOUT_ROWS or self.is_fixed:
             changed = changed * self.active[:, repeat, None, None]
@@ -343,7 +343,7 @@ class _Painter:
         fields[value.slot.name] = new, where | cells
 
     def _stamp(self, repeat: int) -> Array:
-        """The stamp where it stands in each world: uint8 [B, H, W], NOTHING around it."""
+        """The stamp at its position in each world: uint8 [B, H, W], with NOTHING around it."""
         kind, picture = self.maker.kind, self.maker.stamps[str(self.drawing.stamp)]
         index = []
         for axis, side in enumerate(self.maker.size):
@@ -356,7 +356,7 @@ class _Painter:
     def _scattered(self, repeat: int) -> Array:
         """The cells, bool [B, H, W], each of which is set with the chance of `chance` in a hundred.
 
-        A draw of CHANCE_BITS bits is compared with the threshold from the last bit to the first, for 32 cells at once.
+        Draws of CHANCE_BITS bits are compared with the threshold from the last bit to the first, for 32 cells at once.
         """
         kind, percent = self.maker.kind, self.numbers[0]
         assert percent is not None
@@ -381,7 +381,7 @@ def _bordered(rows: tuple[tuple[int, ...], ...], kind: ArrayKind) -> Array:
 
 
 class StartWorlds:
-    """A task's split made executable for one kind of arrays."""
+    """An executable split of a task for one kind of arrays."""
 
     def __init__(self, task: Task, split: str, kind: ArrayKind):
         self.kind = kind
@@ -408,12 +408,12 @@ class StartWorlds:
                 value = int(part.low) + (number * int(part.high - part.low + 1) >> 32)
             else:
                 value = part.low + (part.high - part.low) * (xp.asarray(number, dtype=xp.float64) / 2**32)
-            # As exact as parameters that a caller gives.
+            # As exact as a caller's parameters.
             values[part.name] = xp.asarray(xp.asarray(value, dtype=xp.float32), dtype=xp.float64)
         return values
 
     def make(self, seeds: Array) -> Made:
-        """The start worlds of seeds, int64 [B]; where the split has several variants, each world comes from its own."""
+        """The start worlds of seeds, int64 [B], each from its own variant of the split."""
         if len(self._makers) == 1:
             return self._makers[0].make(seeds)
         variant = seeds % len(self._makers)

@@ -1,4 +1,4 @@
-"""Measures on tensors: cell expressions lowered to one generated function, and sums of what it gives."""
+"""Measures on tensors: cell expressions lowered to one generated function, and sums of its results."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def measures_in(scalars: Iterable[Expr]) -> tuple[Measure, ...]:
 
 @dataclass(frozen=True)
 class Masks:
-    """What counts of packed worlds need besides planes. With one row, all worlds share it.
+    """Inputs of counts of packed worlds besides planes. A single row is shared by all worlds.
 
     `words`, int64 [B or 1, m, H, ⌈W/64⌉], are regions and targets; `sizes`, float64 [B or 1, n], are what the sums of
     measures are divided by.
@@ -60,7 +60,7 @@ class Masks:
 
 
 class Meter:
-    """Measures made executable for one ruleset and size.
+    """Executable measures for one ruleset and size.
 
     `fixed`: the regions that are the same in all worlds, bool [1, H, W].
     """
@@ -84,7 +84,7 @@ class Meter:
         self._regions = sorted(named | {name.removeprefix(REGION_LET) for name in _lets(measures)})
         self._targets = sorted({measure.target for measure in measures if measure.target is not None})
         self.own = bool(self._targets) or not {*self._regions} <= fixed.keys()
-        """Whether each world has masks of its own."""
+        """True if each world has its own masks."""
 
     def take(
         self,
@@ -96,7 +96,7 @@ class Meter:
     ) -> Tensor:
         """The numbers of all measures: float64 [B, n]. `params` are those that differ from the rules' own.
 
-        With `masks`, packed worlds are not unpacked for measures that bit planes show.
+        With `masks`, packed worlds are not unpacked for measures on bit planes.
         """
         values = torch.empty(len(world), len(self.measures), dtype=torch.float64, device=self.device)
         state, counts = world.state, None
@@ -114,7 +114,7 @@ class Meter:
         values: Tensor,
         counts: CellCounts | None,
     ) -> None:
-        """Write the numbers that `counts` does not take into `values`, float64 [B, n]."""
+        """Write the numbers that `counts` does not compute into `values`, float64 [B, n]."""
         left = [number for number in range(len(self.measures)) if not counts or number not in counts.numbers]
         cells = self._cells.of(world, regions, params) if self._cells is not None and left else {}
         for number in left:
@@ -144,7 +144,7 @@ class Meter:
     def _sizes(
         self, measure: Measure, regions: Mapping[str, Tensor], targets: Mapping[str, Tensor]
     ) -> Tensor:
-        """Return what the sum of a measure is divided by: float64 [B or 1]."""
+        """Return the divisor of a measure's sum: float64 [B or 1]."""
         if measure.target is not None:
             size = (targets[measure.target] != NOTHING).sum((1, 2))
         elif measure.how in ("share", "mean") and measure.region is not None:
@@ -155,19 +155,19 @@ class Meter:
         return size.clamp(min=1).double()
 
     def counts(self, program: Places) -> CellCounts | None:
-        """Return a counter of the measures in packed worlds that bit planes show; None if they show none."""
+        """Return a counter of the measures on bit planes of packed worlds; None if there are none."""
         if self._counts is None or self._counts[0] is not program:
             self._counts = program, self._counter(program.layout.planes, self.on_planes)
         return self._counts[1]
 
     @cached_property
     def on_planes(self) -> tuple[int, ...]:
-        """The numbers of the measures that bit planes show."""
+        """The numbers of the measures on bit planes."""
         planes = {slot.name: 0 for slot in plane_slots(_lowered(self.ruleset, ()).slots)}
         return tuple(number for number in range(len(self.measures)) if self._counter(planes, [number]))
 
     def _counter(self, planes: Mapping[str, int], numbers: Sequence[int]) -> CellCounts | None:
-        """Return a counter of some measures, or None if bit planes do not show them all."""
+        """Return a counter of some measures, or None if some need more than bit planes."""
         names = [*self._regions]
         for name in self._targets:
             names += [f"target {name}", *(plane_name(f"target {name}", bit) for bit in self._bits)]
@@ -194,10 +194,10 @@ class Meter:
                         )
             return CellCounts(counted, len(self.measures), planes, masks, self._rows(numbers))
         except (NotBits, KeyError, ValueError):
-            return None  # floats, neighbors, too many gates: tensors show them
+            return None  # floats, neighbors, too many gates: use tensors
 
     def _same(self, target: str) -> Node:
-        """Return the cells that hold the element of a target, as a node on planes and masks."""
+        """Return the cells that match a target, as a node on planes and masks."""
         build = Graph()
         same = build.input(target, FLAG)
         for bit in self._bits:
@@ -224,7 +224,7 @@ class Meter:
         return cells if region is None else cells & regions[region]
 
     def _reduced(self, measure: Measure, cells: Tensor, regions: Mapping[str, Tensor]) -> Tensor:
-        """One number a world, float64 [B], of cells [B, H, W]."""
+        """One number per world, float64 [B], from cells [B, H, W]."""
         mask = None if measure.region is None else regions[measure.region]
         if mask is not None:
             cells = cells & mask if cells.dtype == torch.bool else cells * mask
@@ -256,7 +256,7 @@ def _lets(measures: Sequence[Measure]) -> list[str]:
 
 
 def _lowered(ruleset: Ruleset, measures: Sequence[tuple[int, Measure]]) -> Program:
-    """The cell expressions of numbered measures as a program of one pass, with an output each: ``measure 3``."""
+    """The cell expressions of numbered measures as a program of one pass, with an output for each: ``measure 3``."""
     build = Graph()
     types, regions = _types(ruleset), _lets([measure for _, measure in measures])
     state = {name: build.input(name, type) for name, type in types.items()}
@@ -328,7 +328,7 @@ def scalar_value(scalar: Expr, facts: Facts) -> Tensor:
 
 
 def _value(scalar: Expr, facts: Facts) -> Tensor:
-    """The value as `scalar_value` gives it, or float64 [] where all worlds have the same."""
+    """The result of `scalar_value`, or float64 [] if all worlds have the same value."""
     match scalar.op:
         case "const":
             return torch.full((), float(scalar.value), dtype=torch.float64, device=facts.now.device)

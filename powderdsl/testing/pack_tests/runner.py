@@ -326,7 +326,7 @@ def chance_problem(start: World, example: Example, seed: int) -> str:
         if is_unlikely(hits_of_claim, trials, float(claim.chance)):
             return (
                 f"`{one_line(claim.span)}` came true {hits_of_claim:,} times in {trials:,}, {100 * hits_of_claim / trials:.3g} %,"
-                f" not {100 * float(claim.chance):g} %: luck does that less than once in a million times"
+                f" not {100 * float(claim.chance):g} %: this would happen by chance less than once in a million runs"
             )
     return ""
 

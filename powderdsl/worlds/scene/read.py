@@ -49,7 +49,7 @@ class FileDecl(Record, noun="a file of scenes"):
     about: str = keyed("their purpose, in a sentence", "")
 
 
-SIZE_RULE = f"a world has at least one row and one column, and at most {MAX_CELLS:,} cells"
+SIZE_RULE = f"a world needs at least one row and one column, and has at most {MAX_CELLS:,} cells"
 
 
 @dataclass(frozen=True)
@@ -66,7 +66,7 @@ class Scene:
 
 
 def read_scenes(source: Source, reporter: Reporter) -> tuple[Scene, ...]:
-    """The scenes of a file. All but element names is checked; mistakes go to the reporter."""
+    """The scenes of a file. Everything except element names is checked; mistakes go to the reporter."""
     tree = read_tree(source, reporter, "a scene starts with `scene: NAME`")
     if tree is None:
         return ()
@@ -135,7 +135,7 @@ def covers_nothing(span: Span | None, what: str, size: Size, reporter: Reporter)
 
 
 def _read_statements(node: yaml_tree.Node, reader: Reader) -> tuple[Paint | Setting, ...]:
-    """A list of statements, or a `|` block with one a line, of which some are empty or comments."""
+    """A list of statements, or a `|` block with one per line, of which some may be empty or comments."""
     spans: list[Span] = []
     if isinstance(node, yaml_tree.Sequence):
         for item in node.items:
@@ -143,7 +143,7 @@ def _read_statements(node: yaml_tree.Node, reader: Reader) -> tuple[Paint | Sett
             if span is not None:
                 spans.append(span)
             elif isinstance(item, yaml_tree.Mapping):
-                not_a_statement(item, reader.reporter, "say `48:end` for `48:`, or quote the statement")
+                not_a_statement(item, reader.reporter, "write `48:end` for `48:`, or quote the statement")
             elif isinstance(item, yaml_tree.Sequence):
                 reader.shape(item, "a statement")
     elif isinstance(node, yaml_tree.Scalar) and node.style == "block":
@@ -153,12 +153,12 @@ def _read_statements(node: yaml_tree.Node, reader: Reader) -> tuple[Paint | Sett
                 spans.append(Span(node.content.source, start, start + len(statement)))
             start += len(line)
     elif not (isinstance(node, yaml_tree.Scalar) and node.text == ""):
-        reader.shape(node, "a list of statements", "write `draw:` and below it one `- statement` a line")
+        reader.shape(node, "a list of statements", "write `draw:`, and below it one `- statement` per line")
     return tuple(paint for span in spans if (paint := parse_statement(span, reader.reporter)))
 
 
 def not_a_statement(item: yaml_tree.Mapping, reporter: Reporter, fix: str) -> None:
-    message, label = "YAML reads this statement as a mapping", "a `:` at the end of a word makes it a key"
+    message, label = "YAML reads this statement as a mapping", "a word followed by `:` is a key"
     reporter.error("PD605", message, first_line(item), label, helps=[fix])
 
 
@@ -176,7 +176,7 @@ def parse_statement(span: Span, reporter: Reporter) -> Paint | Setting | None:
 
 
 def _fixed(statement: Statement, usage: str, reporter: Reporter) -> Shape | None:
-    """The shape of a statement, or None after reporting syntax that only generators of tasks support."""
+    """The shape of a statement, or None after reporting syntax that only tasks support."""
     faults: list[tuple[Span, str]] = []
     if statement.choice is not None and statement.choice.kind != "element":
         faults.append((statement.choice.span, "one element, by its name"))
@@ -186,11 +186,11 @@ def _fixed(statement: Statement, usage: str, reporter: Reporter) -> Shape | None
     if statement.where is not None:
         faults.append((statement.where.span, "a scene has no regions"))
     if statement.over is not None:
-        faults.append((statement.over.span, "a scene paints over everything"))
+        faults.append((statement.over.span, "a scene cannot limit painting to some elements"))
     if statement.kind not in STATEMENTS:
         faults = [(statement.span, f"`{statement.kind}` is a statement of tasks")]
     for span, label in faults:
-        reporter.error("PD605", "a scene is the same every time", span, label, helps=(usage,))
+        reporter.error("PD605", "scenes are not random", span, label, helps=(usage,))
     if faults:
         return None
     amounts = amounts_of(statement, {}, reporter)
@@ -223,10 +223,10 @@ def load_start(path_or_name: str | Path, ruleset: Ruleset, *, size: Size | None 
 
     Args:
         path_or_name: a file, ``FILE#NAME`` for one of several scenes, or a shipped scene's name.
-        size: (rows, columns) instead of the scene's: shapes keep their cells; frames and open ends follow the edge.
+        size: (rows, columns) instead of the scene's. Shapes keep their cells; frames and open ends follow the edge.
 
     Raises:
-        CompileError: all mistakes: what `find_scene` and `draw_start` raise.
+        CompileError: the errors of `find_scene` and `draw_start`.
     """
     return draw_start(find_scene(path_or_name), ruleset, size=size)
 
@@ -234,7 +234,8 @@ def load_start(path_or_name: str | Path, ruleset: Ruleset, *, size: Size | None 
 def find_scene(path_or_name: str | Path) -> Scene:
     """A scene from a file, or a shipped one by name, as in `load_start`.
 
-    Raises CompileError: PD601 for an unknown name, PD101 or PD102 for a file that cannot be read, and mistakes in it.
+    Raises CompileError: PD601 for an unknown name, PD101 or PD102 for a file that cannot be read, or mistakes in the
+    file.
     """
     text = str(path_or_name)
     file, _, name = text.rpartition("#") if "#" in text else (text, "", "")
@@ -245,7 +246,7 @@ def find_scene(path_or_name: str | Path) -> Scene:
         if name in scenes:
             return scenes[name]
         message = f"no scene `{name}` in {file}" if name else f"{file} has {len(scenes)} scenes"
-        which = f"say which: {file}#{next(iter(scenes), 'NAME')}"
+        which = f"choose one: {file}#{next(iter(scenes), 'NAME')}"
         raise failure("PD601", message, helps=suggest(name, scenes) if name else (which,))
     return shipped_scene(text)
 
@@ -261,7 +262,7 @@ def shipped_scene(name: str) -> Scene:
 
 
 def shipped_scenes(text: str = "") -> tuple[Scene, ...]:
-    """The scenes that come with the package, of files that contain a text; files in alphabetical order."""
+    """The shipped scenes of files that contain a text, with files in alphabetical order."""
     paths = sorted(shipped("tasks/scenes").glob("*.yaml"))
     return tuple(scene for path in paths if text in path.read_text("utf-8") for scene in read_file(path))
 
@@ -277,7 +278,7 @@ def read_file(path: Path) -> tuple[Scene, ...]:
 
 @lru_cache(maxsize=32)
 def _checked_scenes(source: Source) -> tuple[Scene, ...]:
-    """The scenes of a text: tasks look up those of shipped files again and again. Raises CompileError."""
+    """The scenes of a text, cached because tasks look up shipped files repeatedly. Raises CompileError."""
 
     def read() -> tuple[Scene, ...]:
         reporter = Reporter()
@@ -291,7 +292,7 @@ def _checked_scenes(source: Source) -> tuple[Scene, ...]:
 def draw_start(scene: Scene, ruleset: Ruleset, *, size: Size | None = None) -> Start:
     """The start world of a scene.
 
-    Statements run in order: a field is set in the cells of its shape whose element can have it; painting an element
+    Statements run in order. A field is set in the cells of its shape whose element can have it; painting an element
     later resets the fields there. Raises CompileError for unknown elements (PD604) or fields (PD301), values of another
     kind (PD110) or out of range (PD402), settings that no cell can have (PD608), a bad `size` (PD607).
     """
@@ -299,7 +300,7 @@ def draw_start(scene: Scene, ruleset: Ruleset, *, size: Size | None = None) -> S
     if not (min(size) >= 1 and size[0] * size[1] <= MAX_CELLS):
         raise failure("PD607", f"a world of {size[0]}×{size[1]} cells", helps=(SIZE_RULE,))
     reporter, ids = Reporter(), ids_by_name(ruleset.elements)
-    # Scenes may use qualified names of fields, worlds do not.
+    # Unlike worlds, scenes may use qualified names of fields.
     paints = [
         replace(paint, name=slot_name(ruleset, paint.name)) if isinstance(paint, Setting) else paint
         for paint in scene.paints
@@ -311,10 +312,10 @@ def draw_start(scene: Scene, ruleset: Ruleset, *, size: Size | None = None) -> S
             unknown.setdefault(name, span)
     helps = {name: suggest(name, {e.name for e in ruleset.elements}, "its elements") for name in unknown}
     others = [name for name in unknown if not "".join(helps[name]).startswith("did")]
-    if len(others) > 1:  # not misspelled: drawn for other rules
+    if len(others) > 1:  # not misspelled, but drawn for other rules
         names = ", ".join(f"`{name}`" for name in others)
         message = f"`{scene.name}` is drawn with elements that {ruleset.name} lacks: {names}"
-        fix = "load rules that have them, or name another scene"
+        fix = "load rules that have them, or choose another scene"
         reporter.error("PD604", message, unknown[others[0]], "the first of them", helps=[fix])
     for name in (name for name in unknown if len(others) < 2 or name not in others):
         label = "not an element of this ruleset"
@@ -342,8 +343,8 @@ def draw_start(scene: Scene, ruleset: Ruleset, *, size: Size | None = None) -> S
             cells = cells & np.isin(drawn, sorted(owners))
         if not cells.any():
             names = ", ".join(f"`{e.name}`" for e in ruleset.elements if e.id in (owners or ()))
-            label = f"the shape holds nothing that has `{paint.name}`"
-            fix = f"only these have it: {names}; paint them before"
+            label = f"no cell of the shape can have `{paint.name}`"
+            fix = f"only these elements have it: {names}; paint them first"
             reporter.error("PD608", f"`{paint.name}` is set in no cell", paint.span, label, helps=[fix])
         fields[paint.name].values[..., cells] = np.array(values[paint])[:, None]
         fields[paint.name].where[cells] = True
@@ -352,7 +353,7 @@ def draw_start(scene: Scene, ruleset: Ruleset, *, size: Size | None = None) -> S
 
 
 def owners_of(slot: Slot, ruleset: Ruleset) -> frozenset[int] | None:
-    """The elements whose cells can have another value than the default; None for all."""
+    """The elements whose cells can have a value other than the default; None for all."""
     prop = ruleset.property(slot.name)
     return slot.of if prop is None else prop.stored
 

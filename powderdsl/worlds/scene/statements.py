@@ -1,4 +1,5 @@
-"""Drawing statements: the syntax of one line -> a `Statement`, and its numbers: constants, names, draws (`a..b`), arithmetic.
+"""Drawing statements: the syntax of one line -> a `Statement` with numbers (constants, names, draws `a..b`,
+arithmetic).
 
 `worlds.raster` computes the cells that a shape covers.
 """
@@ -35,7 +36,7 @@ GENERATOR_STATEMENTS = {
     "stamp": "stamp NAME at (ROW, COLUMN)",
     "part": "part NAME",
 }
-"""The statements of a generator, which also has random cells, pictures, and named lists of statements."""
+"""The statements of a generator, including random cells, pictures, and named lists of statements."""
 
 SETTING = "FIELD := VALUE in SHAPE"
 """The statement that sets a field in cells; without `in`, in all cells."""
@@ -57,7 +58,7 @@ NUMBERS: dict[str, tuple[tuple[str, int], ...]] = {
     "stamp": _POINT,
     "part": (),
 }
-"""The numbers of each statement in order: the name in messages, and the lowest value."""
+"""The numbers of each statement in order: the name in messages and the minimum."""
 
 RANGES = {"box": 2, "arch": 2, "container": 2}
 """The number of ranges at the start of a statement's numbers: pairs of a start and an end, None for an open end."""
@@ -95,13 +96,13 @@ def amounts_of(
             fits &= written is None
             continue
         low, high = int(amount.kind.lo), int(amount.kind.hi)
-        # A computed range may begin outside the world, where shapes are cut off anyway.
+        # A computed range may begin outside the world, since shapes are clipped anyway.
         is_cut = statement.kind in RANGES and lowest == 0 and written.kind not in ("integer", "neg")
         least = -most if is_cut else max(lowest, -most)
         greatest = 100 if statement.kind == "scatter" else most
         if low < least or high > greatest:
             can_be = f"it can be {low}..{high}" if low < high else f"it is {low}"
-            message = f"{what} must lie in {least}..{greatest}"
+            message = f"{what} must be in {least}..{greatest}"
             reporter.error("PD606", message, written.span, can_be)
             fits = False
     return tuple(amounts) if fits else None
@@ -160,7 +161,7 @@ def _numbers(tree: Syntax, parts: Sequence[Syntax], reporter: Reporter) -> tuple
                 numbers += [start, Syntax("add", (start, unit), "", start.span)]
             case "between", (start, stop):
                 if start.kind == stop.kind == "integer" and int(stop.text) <= int(start.text):
-                    label = "the end must be above the start: a:b leaves b out"
+                    label = "the end must be greater than the start: a:b excludes b"
                     reporter.error("PD606", f"a range without {axis}", extent.span, label)
                     return None
                 numbers += [start, stop]
@@ -175,7 +176,7 @@ def _numbers(tree: Syntax, parts: Sequence[Syntax], reporter: Reporter) -> tuple
             if not part.span.text.endswith("%"):
                 end = Span(part.span.source, part.span.end, part.span.end + 1)
                 usage = (GENERATOR_STATEMENTS[tree.kind],)
-                reporter.error("PD605", "a chance without its sign", end, "expected `%`", helps=usage)
+                reporter.error("PD605", "a chance without a percent sign", end, "expected `%`", helps=usage)
                 return None
             numbers += map(_without_signs, part.children)
         elif part.kind == "point":
@@ -251,8 +252,8 @@ def read_amount(
     if op == "uniform":
         (low, first_high), (second_low, high) = ranges
         if low > high:
-            label = "the first must not be above the second"
-            reporter.error("PD606", f"a range {low}..{high} without numbers", span, label)
+            label = "the first must not be greater than the second"
+            reporter.error("PD606", f"an empty range {low}..{high}", span, label)
             return None
         if len(values) == 2 and low == high:
             return number(low, span)
@@ -263,7 +264,7 @@ def read_amount(
     if op == "mod":
         modulus = args[1].value
         if args[1].op != "const" or modulus < 0:
-            reporter.error("PD606", "`mod` takes a constant above 0", args[1].span, "not a constant above 0")
+            reporter.error("PD606", "`mod` needs a constant above 0", args[1].span, "not a constant above 0")
             return None
         amount = Expr("mod", integer(0, modulus - 1), args[:1], modulus, span)
     else:
