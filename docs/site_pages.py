@@ -33,6 +33,15 @@ from powderdsl.tasks.shipped import load_task, shipped_tasks
 
 ROOT = Path(__file__).resolve().parents[1]
 CACHE = ROOT / ".site"
+BOOSTS = {
+    "guides/recipes.md": 2,
+    "tutorials/": 1.5,
+    "language/": 1.5,
+    "diagnostics.md": 0.3,
+    "elements/": 0.3,
+    "tasks/": 0.3,
+}
+"""How much more, or less, the search makes of pages than of others; it leaves out decisions."""
 SHIM = "assets/javascripts/iframe-worker.js"
 COPIED = {"index.md": "README.md", "changelog.md": "CHANGELOG.md", "contributing.md": "CONTRIBUTING.md"}
 LINK = re.compile(r"(\]\()([^)\s#:]+)(#[^)\s]*)?(\))")
@@ -386,13 +395,16 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
 def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Files) -> str:
     """Leave out comments, and lead links to files outside of docs/ to the repository."""
     page_path = page.file.src_uri
+    boosts = [boost for start, boost in BOOSTS.items() if page_path.startswith(start)]
+    page.meta["search"] = {"exclude": page_path.startswith("decisions/0"), "boost": max(boosts, default=1)}
     folder = PurePosixPath("docs", page_path).parent if page_path not in COPIED else PurePosixPath(".")
 
     def link(match: re.Match[str]) -> str:
         target = os.path.normpath(folder / match[2]).replace(os.sep, "/")
         copied = {name: page for page, name in COPIED.items()}
         inside = copied.get(target) or (target.removeprefix("docs/") if target.startswith("docs/") else "")
-        if inside and files.get_file_from_path(inside):
+        file = files.get_file_from_path(inside) if inside else None
+        if file and file.inclusion.is_included():
             leads = os.path.relpath(inside, PurePosixPath(page_path).parent).replace(os.sep, "/")
         else:
             kind = "tree" if (ROOT / target).is_dir() else "blob"
@@ -413,9 +425,12 @@ def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Fil
 
 
 def on_post_page(output: str, page: Page, config: MkDocsConfig) -> str:
-    """Load the shim by which the search works in pages opened as files from the site itself, not from elsewhere."""
+    """Name the dialog of the search, and load the shim by which the search works in files from the site itself."""
     leads = os.path.relpath(SHIM, PurePosixPath(page.file.dest_uri).parent).replace(os.sep, "/")
-    return output.replace("https://unpkg.com/iframe-worker/shim", leads)
+    named = output.replace(
+        'component="search" role="dialog"', 'component="search" role="dialog" aria-label="Search"'
+    )
+    return named.replace("https://unpkg.com/iframe-worker/shim", leads)
 
 
 def on_post_build(config: MkDocsConfig) -> None:
