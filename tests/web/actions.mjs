@@ -57,7 +57,8 @@ function prepare() {
   const NAMES = ["red", "sand", "my_pack", "", "9", "a b", "core"];
   const use = () => {
     const skipped = "a, #file, #open, #save-gif, #save-webm, #save-world, #save-rules, #gallery button";
-    const all = [...document.querySelectorAll("button, select, input, summary")];
+    const within = document.querySelector("dialog:modal") ?? document; // nobody reaches what lies behind it
+    const all = [...within.querySelectorAll("button, select, input, summary")];
     const target = one(all.filter((each) => each.checkVisibility() && !each.disabled && !each.matches(skipped)));
     if (target.matches("#checks button, [data-tool=look]") && below(10)) return "nothing"; // they take the compiler seconds
     if (target.id === "rules" && below(3)) return "nothing";
