@@ -18,7 +18,7 @@ from powderdsl.model.declarations import PackDecl
 from powderdsl.model.schema import NAME
 from powderdsl.model.types import Ruleset
 from powderdsl.syntax.parse import reserved_words
-from powderdsl.syntax.sources import OPEN, shipped
+from powderdsl.syntax.sources import OPEN, read_source, shipped
 from powderdsl.syntax.yaml_tree import Mapping, Node, Scalar, parse_yaml
 
 if TYPE_CHECKING:
@@ -179,8 +179,8 @@ class Workspace:
 
     def outline(self, path: Path) -> tuple[Symbol, ...]:
         """The sections of a file and their entries."""
-        tree = parse_yaml(Source(str(path), self.text(path)), Reporter())
-        return _symbols(tree, 2)
+        source = read_source(path, Reporter())
+        return _symbols(parse_yaml(source, Reporter()) if source else None, 2)
 
     def _rules(self, path: Path) -> Rules:
         if path not in self.rules:

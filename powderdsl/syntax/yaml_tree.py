@@ -7,11 +7,13 @@ Every node has its span in the file. Scalars are text, interpreted by the schema
 from __future__ import annotations
 
 import re
+from contextlib import suppress
 from dataclasses import dataclass
+from functools import lru_cache
 
 import yaml
 
-from powderdsl.diagnostics import Diagnostic, Label, Reporter, Source, Span
+from powderdsl.diagnostics import CompileError, Diagnostic, Label, Reporter, Source, Span
 from powderdsl.syntax import pure_yaml
 
 MAX_CHARACTERS = 1 << 20
@@ -78,6 +80,22 @@ Node = Scalar | Sequence | Mapping
 
 def parse_yaml(source: Source, reporter: Reporter) -> Node | None:
     """Parse a whole file; None after reporting mistakes."""
+    tree, found = _parsed(source)
+    for diagnostic in found:
+        reporter.add(diagnostic)
+    return tree
+
+
+@lru_cache(maxsize=4)
+def _parsed(source: Source) -> tuple[Node | None, tuple[Diagnostic, ...]]:
+    """The tree of a file, and its diagnostics: editors ask for the outline after each check."""
+    reporter = Reporter()
+    with suppress(CompileError):  # more errors than the limit
+        return _parse(source, reporter), reporter.diagnostics
+    return None, reporter.diagnostics
+
+
+def _parse(source: Source, reporter: Reporter) -> Node | None:
     text = source.text
     if len(text) > MAX_CHARACTERS:
         notes = [f"{source.name}: a rule file may have {MAX_CHARACTERS:,} characters"]

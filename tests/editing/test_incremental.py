@@ -12,14 +12,14 @@ from powderdsl import compiler
 from powderdsl.diagnostics import Diagnostic
 from powderdsl.editing.workspace import Workspace
 from powderdsl.model.logic import satisfy
-from powderdsl.syntax import parse
+from powderdsl.syntax import parse, yaml_tree
 from powderdsl.system import cache
 from powderdsl.universes import universe_text
 from tests.editing.test_lsp import PACK, broken
 
 KEPT = [
     kept
-    for module in (compiler, satisfy, parse)
+    for module in (compiler, satisfy, parse, yaml_tree)
     for kept in vars(module).values()
     if isinstance(kept, _lru_cache_wrapper) and kept.cache_parameters()["maxsize"] is not None
 ]
@@ -40,7 +40,7 @@ def test_edits_after_edits_have_the_mistakes_of_a_first_check(
     folder: Path, monkeypatch: pytest.MonkeyPatch, text: str, beside: str, edits: int
 ) -> None:
     monkeypatch.setattr(cache, "STORED", False)
-    assert len(KEPT) >= 4
+    assert len(KEPT) >= 6
     files, path, draw, now = Workspace(beside), folder / "slime.yaml", random.Random(1), text
     for number in range(edits):
         now = broken(now, draw) if number % 5 else text

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import sys
 from collections.abc import Sequence
@@ -114,6 +115,8 @@ def server(beside: str = "") -> Any:
         own = str(from_fs_path(str(path)))
         by_file: dict[str, list[lsp.Diagnostic]] = {own: []}
         mistakes[path] = files.check(path)
+        if not shown:
+            gc.freeze()  # modules and shipped packs: searching them again and again takes as long as a check
         for diagnostic in mistakes[path]:
             span = diagnostic.primary.span
             by_file.setdefault(own if span is None else uri_of(span), []).append(as_lsp(diagnostic))
