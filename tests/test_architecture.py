@@ -26,7 +26,7 @@ MAP = ROOT / "docs" / "architecture.md"
 MADE_FOLDERS = ("web/made", "web/parts")
 """Folders that `make web` and `make wheel` write, and git ignores."""
 MAX_LINES = 800
-LINE_BUDGET = 58_919
+LINE_BUDGET = 58_940
 """Lines of Python that powderdsl/ may have."""
 
 EMPTY_NAMES = ("utils", "util", "common", "helpers", "helper", "base", "misc")
@@ -38,6 +38,7 @@ NAME_SECTIONS = ("elements", "passes", "fields", "properties")
 PYTHON_WORDS = {
     "empty": "np.empty, torch.empty; a world or a set that is empty",
     "clone": "Tensor.clone",
+    "freeze": "gc.freeze",
 }
 """Names in the shipped rules that are also words of Python or its libraries: allowed everywhere."""
 

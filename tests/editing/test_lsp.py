@@ -169,7 +169,7 @@ def test_words_are_explained_found_and_renamed(folder: Path) -> None:
 
         assert "**element** `slime` of pack `slime`: it creeps" in await hover("- sli")
         assert "id 40, color #55AA22\n\nits number is constant" in await hover("- sli")
-        assert "quoted" in await hover("id: 40, col")
+        assert "in quotes" in await hover("id: 40, col")
         assert "pack `core`" in await hover("below is em")
 
         params = lsp.DefinitionParams(editor.document, editor.at("below is em"))
