@@ -87,6 +87,7 @@ function recheck() {
 }
 
 function show(name) {
+  if (!(name in rules.files)) return; // a tab that waits for a name to be typed
   rules.shown = name;
   editor.show(name);
   editor.mark(rules.diagnostics);
