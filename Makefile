@@ -1,10 +1,10 @@
-# Everything a developer types. `make` or `make help` lists the targets.
+# Commands for developers. `make` or `make help` lists the targets.
 # A fresh Debian needs: apt install make python3 python3-venv
 
 PYTHON ?= python3
-# Extra options of pip's for torch alone, e.g. --extra-index-url https://download.pytorch.org/whl/cpu where no GPU is wanted.
+# Extra pip options for torch only, e.g. --extra-index-url https://download.pytorch.org/whl/cpu without a GPU.
 TORCH_FLAGS ?=
-# More options for pytest, and how many processes it may use: `make test ARGS="-k melt" JOBS=0`.
+# Further options for pytest, and its number of processes: `make test ARGS="-k melt" JOBS=0`.
 ARGS ?=
 JOBS ?= auto
 
@@ -17,7 +17,7 @@ PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check
 INSTALL := $(PIP) --constraint constraints.txt
 TORCH := $(shell sed -n 's/^torch==//p' constraints.txt)
 
-# One thread a process: pytest runs several processes, and small tensors gain nothing from threads.
+# One thread per process: pytest runs several processes, and small tensors gain nothing from threads.
 test test-all golden: export OMP_NUM_THREADS ?= 1
 
 .DEFAULT_GOAL := help
@@ -27,8 +27,8 @@ test test-all golden: export OMP_NUM_THREADS ?= 1
 help:  ## list these targets
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/\1|\2/p' $(MAKEFILE_LIST) | while IFS='|' read -r name about; do printf '  make %-10s %s\n' "$$name" "$$about"; done
 
-# Two stamps: what running needs, and what developing needs on top. The second call of either is instant.
-# torch comes first and by exact version: a range would take the newest release, with gigabytes of CUDA beside it.
+# Two stamps: packages for running, and those for development. Repeated calls are instant.
+# torch comes first and by exact version: a range would take the newest release, including gigabytes of CUDA.
 $(VENV)/.core: pyproject.toml constraints.txt
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { echo "powderdsl needs Python 3.11 or newer; try: make PYTHON=python3.11 $(MAKECMDGOALS)" >&2; exit 1; }
 	@$(PYTHON) -c 'import ensurepip' || { echo "Python's venv module is missing; on Debian: apt install python3-venv" >&2; exit 1; }
@@ -53,7 +53,7 @@ tests/web/node_modules: tests/web/package-lock.json
 	@npm ci --prefix tests/web --no-audit --no-fund --loglevel error
 	@touch $@
 
-setup: $(VENV)/.ready  ## make .venv with everything a developer needs
+setup: $(VENV)/.ready  ## create .venv with all development tools
 
 demo: $(VENV)/.core  ## run a designed world and write demo.gif
 	@$(BIN)/powderdsl run powderworld --world garden --steps 240 --out demo.gif
@@ -74,14 +74,14 @@ test-all: $(VENV)/.ready  ## run the slow tests too: long searches for mistakes 
 
 check: lint types test  ## lint, types and test
 
-lint: $(VENV)/.ready  ## ruff: mistakes and layout
+lint: $(VENV)/.ready  ## run ruff: lint and format check
 	@$(BIN)/ruff check .
 	@$(BIN)/ruff format --check .
 
 types: $(VENV)/.ready  ## mypy over the package
 	@$(BIN)/mypy
 
-format: $(VENV)/.ready  ## lay the code out as `make lint` wants it
+format: $(VENV)/.ready  ## format the code as `make lint` requires
 	@$(BIN)/ruff check --fix .
 	@$(BIN)/ruff format .
 
@@ -114,7 +114,7 @@ release: $(VENV)/.ready web  ## build and check dist/*.tar.gz and dist/*.whl, fo
 	@$(BIN)/twine check --strict dist/*
 	@$(BIN)/python -m tests.release dist/*
 
-clean:  ## remove what the targets made, except .venv
+clean:  ## remove build products, except .venv
 	@rm -rf build dist site .site demo.gif .pytest_cache .mypy_cache .ruff_cache .hypothesis
 	@find powderdsl tests -name __pycache__ -type d -prune -exec rm -rf {} +
 

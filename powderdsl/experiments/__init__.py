@@ -1,1 +1,1 @@
-"""Experiments: measuring speed, the folders of runs, and studies over many of them."""
+"""Experiments: benchmarks, run folders, and studies of many runs."""

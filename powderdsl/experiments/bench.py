@@ -1,7 +1,7 @@
 """Benchmarks of rules: the plan of a measurement, its worlds, rounds of measuring, and reports as text and JSON.
 
-Worlds are made from a ruleset's tables alone: no element has a name here. Rounds are interleaved, so that a machine that
-is slow for a while is slow for all combinations alike.
+Worlds are created only from a ruleset's tables, without naming elements. Rounds are interleaved, so that slowdowns of
+the machine affect all combinations alike.
 """
 
 from __future__ import annotations
@@ -49,12 +49,12 @@ WORKLOADS: dict[str, str] = {
 State = dict[str, NDArray[Any]]
 """The state of a batch: `element` as uint8 [N, H, W], fields as [N, H, W] or, vectors, [N, 2, H, W], by name."""
 Run = Callable[[int], object]
-"""Makes so many steps; the next call continues from there."""
+"""Makes a number of steps; the next call continues from there."""
 
 
 @dataclass(frozen=True)
 class Program:
-    """A program that is measured beside the backends. `load` is not timed; what it returns is."""
+    """A program to measure along with the backends. `load` is not timed, but the function that it returns is."""
 
     name: str
     load: Callable[[State], Run]
@@ -63,7 +63,7 @@ class Program:
 class Cell(NamedTuple):
     """One combination of the cross product. `size` is (rows, columns) of a world.
 
-    `backend` may be the name of a program that is measured beside the backends.
+    `backend` may be the name of a program.
     """
 
     backend: str
@@ -78,15 +78,15 @@ class Cell(NamedTuple):
 
 @dataclass(frozen=True)
 class Plan:
-    """All that a measurement depends on: the cross product of backends and programs, sizes, threads and batches.
+    """The settings of a measurement: the cross product of backends and programs, sizes, threads and batches.
 
     A sample is as many calls of `Simulator.step` as fit into ``seconds / rounds``, each of up to `steps` steps
     from the same worlds. `workload` is one of `WORKLOADS`, `only` names the elements on the ground, `profile` times
     each pass too, and `check` compares each backend with another one on the CPU and counts its kernels.
 
     Raises:
-        ValueError: an unknown element, a size that the rules do not take, or a program's name that is taken.
-        CompileError: PD607 for worlds of more cells than fit.
+        ValueError: an unknown element, a size that the rules do not allow, or the name of a program that is taken.
+        CompileError: PD607 for worlds with too many cells.
     """
 
     ruleset: Ruleset
@@ -148,7 +148,7 @@ NOISE = 3.0
 
 
 def start_worlds(sim: Simulator, plan: Plan, cell: Cell) -> World:
-    """The worlds of a cell: world i depends on the plan, its size and i alone."""
+    """The worlds of a cell. World i depends only on the plan, the size and i."""
     streams = [np.random.default_rng([plan.seed, index]) for index in range(cell.batch)]
     ids = np.stack([_ids(plan, cell, random) for random in streams])
     moving = {"noise": ("real", "vec2"), "gusts": ("vec2",)}.get(plan.workload, ())
@@ -191,7 +191,7 @@ def _field(field: Field, cell: Cell, workload: str, random: np.random.Generator)
 
 
 def _scaled(count: int, cell: Cell) -> int:
-    """A number for `PER_CELLS` cells, for the worlds of a cell of the plan."""
+    """Scale a number per `PER_CELLS` cells to the worlds of a cell of the plan."""
     return max(1, round(count * math.prod(cell.size) / PER_CELLS))
 
 
@@ -201,7 +201,7 @@ def _scaled(count: int, cell: Cell) -> int:
 def read_program(path: Path) -> Program:
     """Run a Python file that defines `load(state)`, which returns `run(steps)`. Its name is the file's.
 
-    The file is run as `python` would run it, so it has to be trusted. Raises ValueError if that is not possible.
+    The file is executed, so it must be trusted. Raises ValueError if that fails.
     """
     with _located(path):
         load = runpy.run_path(str(path), run_name=f"beside_{path.stem}").get("load")
@@ -220,7 +220,7 @@ def read_program(path: Path) -> Program:
 
 @contextmanager
 def _located(path: Path) -> Iterator[None]:
-    """Name the line of a file that led to an exception; also a decorator."""
+    """Report the line of a file that led to an exception; also a decorator."""
     try:
         yield
     except Exception as error:
@@ -236,7 +236,7 @@ EQUAL = "equal"
 
 
 def disagreement(world: World, other: World, most: int = 8) -> str:
-    """The first place where two simulators differ, in calls of up to `most` steps; empty if they are equal."""
+    """The first difference of two simulators in calls of up to `most` steps; empty if they are equal."""
     ahead, wanted = world, other
     for steps in range(1, most + 1):
         ahead, wanted = (side.sim.step(side) for side in (ahead, wanted))
@@ -286,20 +286,20 @@ class CellFigures:
 
     @property
     def processor_microseconds(self) -> float:
-        """Processor time of a world and step."""
+        """Processor time per world and step."""
         return 1e6 * median(self.round_processor_seconds) / self.world_steps
 
 
 @dataclass(frozen=True)
 class Report:
-    """A plan and the figures of its cells."""
+    """A plan and the results of its cells."""
 
     plan: Plan
     machine: Mapping[str, Any]
     cells: tuple[CellFigures, ...]
 
     def ratio(self, figures: CellFigures, program: str) -> float | None:
-        """The processor time of a cell divided by that of a program for the same worlds; None if it is unknown."""
+        """The processor time of a cell divided by that of a program for the same worlds; None if unknown."""
         same = figures.cell._replace(backend=program)
         times = [other.processor_microseconds for other in self.cells if other.cell == same]
         return figures.processor_microseconds / times[0] if figures.rates and times and times[0] else None
@@ -324,7 +324,7 @@ def measuring(plan: Plan, cells: list[CellFigures]) -> Iterator[tuple[str, Cell]
 
     @contextmanager
     def running(figures: CellFigures) -> Iterator[None]:
-        """With the threads of a cell. If backends are checked, an error of one is kept, and the others still run."""
+        """Use the threads of a cell. If backends are checked, an error of one is recorded, and the others still run."""
         torch.set_num_threads(figures.cell.threads)
         try:
             yield
@@ -377,7 +377,7 @@ def measuring(plan: Plan, cells: list[CellFigures]) -> Iterator[tuple[str, Cell]
 class _Subject:
     """The subject of a measurement: a simulator, or a program that loads the simulator's worlds.
 
-    A round makes some calls of some steps, each from the same worlds.
+    A round makes several calls of several steps, each from the same worlds.
     """
 
     sim: Simulator
@@ -386,7 +386,7 @@ class _Subject:
     figures: CellFigures
 
     def begin(self, plan: Plan) -> None:
-        """Make the first step, and find out how many calls fit into a round, loading included."""
+        """Make the first step, and determine the number of calls per round, loading included."""
         figures, budget = self.figures, plan.seconds / plan.rounds
         figures.first_step_seconds = self.timed(1, 1)[0]
         if self.program is None:
@@ -397,7 +397,7 @@ class _Subject:
         figures.calls_per_round = max(1, int(budget / max(time.perf_counter() - began, 1e-9)))
 
     def timed(self, steps: int, calls: int) -> tuple[float, float]:
-        """Seconds, and processor seconds, of some calls. A program loads its worlds before each call, untimed."""
+        """Seconds, and processor seconds, of some calls. A program loads its worlds, untimed, before each call."""
         loads = 1 if self.program is None else calls
         seconds = processor_seconds = 0.0
         for _ in range(loads):
@@ -430,7 +430,7 @@ class _Subject:
         return sum(not (event.cpu_children or event.is_user_annotation) for event in events) / steps
 
     def profile(self) -> None:
-        """Measure the microseconds a world and step of each pass, if the backend can report them."""
+        """Measure the microseconds per world and step of each pass, if the backend can report them."""
         figures = self.figures
         if self.program is not None or not self.sim.profile(self.world, 1):
             return
@@ -445,7 +445,7 @@ class _Subject:
 
 
 def this_machine(device: str) -> dict[str, Any]:
-    """This machine, and the versions of what runs on it. Raises CompileError (PD701) without such a torch device."""
+    """This machine and its software versions. Raises CompileError (PD701) without such a torch device."""
     import torch
 
     from powderdsl.simulation.programs import find_device
@@ -492,7 +492,7 @@ def report_data(report: Report) -> dict[str, Any]:
 
 
 def report_text(report: Report) -> str:
-    """The whole report, without a newline at its end."""
+    """The whole report, without a final newline."""
     plan, machine = report.plan, report.machine
     header = [
         f"{plan.ruleset.name}, worlds of {plan.workload}: {WORKLOADS[plan.workload]}",
@@ -504,13 +504,13 @@ def report_text(report: Report) -> str:
     shown = str(steps[0]) if len(steps) == 1 else f"{steps[0]} to {steps[-1]}"
     notes = [
         f"medians of {plan.rounds} interleaved rounds; a call makes {shown} steps, always from the same worlds",
-        "CPUs: processor time by time; less than the threads means that others were at work",
+        "CPUs: processor time by time; less than the threads if other processes were running",
         "to first step: compiling, which all lines of a backend share, and the first step",
     ]
     if plan.check:
         notes.append("kernels/step: with copies, on a GPU; on the CPU, operators that call no others")
     if plan.programs:
-        notes.append("÷: processor time divided by that of another program, from the same worlds")
+        notes.append("÷: processor time divided by that of another program on the same worlds")
     parts += [_cell_table(report), "\n".join(notes)]
     if profiled := [figures for figures in report.cells if figures.passes]:
         parts.append(_pass_table(profiled))
@@ -518,7 +518,7 @@ def report_text(report: Report) -> str:
 
 
 def _cell_table(report: Report) -> str:
-    """One line per cell, and a column for each program beside the backends."""
+    """One line per cell, and a column for each program."""
     titles = ["backend", "batch", "size", "threads", "world-steps/s", "slowest..fastest", "µs/world-step"]
     programs = [program.name for program in report.plan.programs]
     checks = ["kernels/step", "check"] if report.plan.check else []
@@ -540,7 +540,7 @@ def _cell_table(report: Report) -> str:
 
 
 def _pass_table(profiled: Sequence[CellFigures]) -> str:
-    """µs a world and step of each pass, and its share, for each cell that was profiled."""
+    """µs per world and step of each pass, and its share, for each profiled cell."""
     totals = [sum(figures.passes.values()) for figures in profiled]
     rows = [["µs/world-step", *(str(figures.cell) for figures in profiled)]]
     for name in profiled[0].passes:

@@ -1,6 +1,6 @@
-"""Folders of training runs: `run.json` describes the run; checkpoints and metrics have its progress.
+"""Folders of training runs, with `run.json`, which describes the run, checkpoints and metrics.
 
-A killed process leaves a readable folder: checkpoints are written whole or not at all, with their digest in their names.
+A killed process leaves a readable folder: checkpoints are written atomically, with their digest in the name.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ MAX_SLOTS = 256
 
 NAME = re.compile(r"([0-9]{12})-([0-9a-f]{16})\.safetensors")
 STATE = "state"
-"""The tensor whose bytes are the state as JSON, with the names of the other tensors in their places."""
+"""The tensor whose bytes are the state as JSON, in which names replace the other tensors."""
 
 MAX_BYTES = 1 << 33
 
@@ -53,13 +53,13 @@ class Checkpoint:
 
 
 def _packed(value: Any, tensors: dict[str, Tensor]) -> Any:
-    """A state as JSON has it: what is neither a list nor a plain value becomes a pair of its kind and contents."""
+    """A state for JSON: values other than lists and plain values become pairs of kind and contents."""
     import torch
 
     match value:
         case torch.Tensor():
             name = str(len(tensors))
-            # safetensors takes no tensors that share memory, as those of a network may.
+            # safetensors rejects tensors that share memory, as those of a network may.
             tensors[name] = value.detach().cpu().clone(memory_format=torch.contiguous_format)
             return {"tensor": name}
         case dict():
@@ -72,7 +72,7 @@ def _packed(value: Any, tensors: dict[str, Tensor]) -> Any:
 
 
 def _unpacked(value: dict[str, Any], tensors: Mapping[str, Tensor]) -> Any:
-    """Rebuild a value from its kind and its contents, which are unpacked already."""
+    """Rebuild a value from its kind and unpacked contents."""
     match value:
         case {"tensor": name}:
             return tensors[name]
@@ -91,7 +91,7 @@ def _digest(data: bytes) -> str:
 
 LINES = "metrics.jsonl"
 MAX_LINE = 1 << 16
-"""Bytes of a line."""
+"""Maximum number of bytes of a line."""
 T_975 = (12.706, 4.303, 3.182, 2.776, 2.571, 2.447, 2.365, 2.306, 2.262, 2.228)
 """97.5 % quantiles of Student's t for 1 to 10 degrees of freedom, for which no short formula is exact enough."""
 
@@ -99,8 +99,8 @@ T_975 = (12.706, 4.303, 3.182, 2.776, 2.571, 2.447, 2.365, 2.306, 2.262, 2.228)
 class Metrics:
     """Writes numbers by step. A context manager.
 
-    The run continues at `step`; what was written for later steps is dropped, so that a run that was killed after its last
-    checkpoint writes nothing twice.
+    The run continues at `step`; entries of later steps are dropped, so that a run killed after its last checkpoint does
+    not write anything twice.
     """
 
     def __init__(self, folder: Path, step: int = 0):
@@ -110,13 +110,13 @@ class Metrics:
             temporary.write_text("".join(f"{line}\n" for line in lines), encoding="utf-8")
         self._file = self._lines.open("a", encoding="utf-8")
         self._events = None
-        with suppress(ImportError):  # without TensorBoard, the lines hold the same
+        with suppress(ImportError):  # without TensorBoard, the lines have the same numbers
             from torch.utils.tensorboard import SummaryWriter
 
             self._events = SummaryWriter(str(folder / "tensorboard"), purge_step=step + 1 if step else None)
 
     def write(self, step: int, values: Mapping[str, float]) -> None:
-        """Numbers by name, such as ``loss/train``, after `step` steps. What is not finite is left out of the lines."""
+        """Numbers by name, such as ``loss/train``, after `step` steps. Lines omit those that are not finite."""
         numbers = {name: float(value) for name, value in values.items()}
         finite = {name: value for name, value in numbers.items() if math.isfinite(value)}
         with writing(self._lines):
@@ -137,7 +137,7 @@ class Metrics:
 
 
 def read_metrics(folder: Path) -> Iterator[dict[str, Any]]:
-    """The lines of a run, each with ``step``. A last line that a kill cut short is left out."""
+    """The lines of a run, each with ``step``, without an incomplete last line."""
     with suppress(FileNotFoundError), open_regular(folder / LINES) as file:
         for text in iter(lambda: file.readline(MAX_LINE), b""):
             with suppress(ValueError):
@@ -165,7 +165,7 @@ def mean_and_interval(values: Sequence[float]) -> Estimate:
     mean, freedom = statistics.fmean(values), len(values) - 1
     if freedom < 1:
         return Estimate(mean, None)
-    # Beyond the table: the expansion of Cornish and Fisher, exact to four digits.
+    # Beyond the table, use the Cornish-Fisher expansion, exact to four digits.
     expansion = 1.95996 + 2.37227 / freedom + 2.8225 / freedom**2 + 2.5557 / freedom**3
     quantile = T_975[freedom - 1] if freedom <= len(T_975) else expansion
     return Estimate(mean, quantile * statistics.stdev(values) / math.sqrt(len(values)))
@@ -178,7 +178,7 @@ def mean_and_interval(values: Sequence[float]) -> Estimate:
 class RunFolder:
     """A folder of one training run.
 
-    `kind` is what was trained; `config` all that decides how, as JSON has it; `about` the whole of ``run.json``: also
+    `kind` is what was trained; `config` has all its settings, as JSON; `about` is the whole of ``run.json``, including
     versions.
     """
 
@@ -188,10 +188,10 @@ class RunFolder:
     about: Mapping[str, Any]
 
     def latest_checkpoint(self) -> Checkpoint | None:
-        """The newest checkpoint whose digest is right, with its tensors on the CPU, or None. Damaged ones are passed over.
+        """The newest checkpoint with a correct digest, with its tensors on the CPU, or None. Damaged ones are skipped.
 
         Loading executes nothing: only tensors and plain values are read, and they take no more memory than the file.
-        Raises CompileError (PD620) for a file that is whole and holds something else.
+        Raises CompileError (PD620) for an intact file that is not a checkpoint.
         """
         for step, digest, path in self._checkpoints():
             try:
@@ -209,7 +209,7 @@ class RunFolder:
                     return Checkpoint(step, state, path)
                 except ModuleNotFoundError:  # no safetensors
                     raise
-                except Exception as error:  # a crafted file raises whatever it likes
+                except Exception as error:  # a crafted file can raise any exception
                     why = (str(error).strip().partition("\n")[0] or type(error).__name__)[:300]
                     raise failure("PD620", f"{path} is not a checkpoint of a run", notes=(why,)) from None
         return None
@@ -218,13 +218,13 @@ class RunFolder:
         """The newest intact checkpoint. Raises CompileError (PD620) if there is none."""
         checkpoint = self.latest_checkpoint()
         if checkpoint is None:
-            raise not_a_run(self.path, "it has no checkpoint that can be read")
+            raise not_a_run(self.path, "it has no readable checkpoint")
         return checkpoint
 
     def save_checkpoint(self, step: int, state: Any) -> Path:
         """Save nested dicts, lists and tuples of tensors, numbers, text and None, and remove older checkpoints but one.
 
-        Raises CompileError (PD613) if the folder cannot be written to, or the disk is full.
+        Raises CompileError (PD613) if the folder cannot be written to.
         """
         import torch
         from safetensors.torch import save
@@ -240,7 +240,7 @@ class RunFolder:
         others = [(number, other) for number, _, other in self._checkpoints() if other != path]
         before = next((other for number, other in others if number < step), None)
         for _, other in others:
-            # Later ones are left by a run that had to go back; they must not be taken for newer.
+            # Later ones are from a run that had to go back, and must not be considered newer.
             if other != before:
                 other.unlink(missing_ok=True)
         return path
@@ -257,9 +257,9 @@ def open_run(
 ) -> RunFolder:
     """Begin a run, or resume it with the same configuration.
 
-    `config`: what JSON can hold. `note`: more to keep in ``run.json``, which takes no part in the comparison. Raises
-    CompileError: PD621 where the folder holds another run, or other files; PD620 where its ``run.json`` is damaged;
-    PD613 where nothing can be written.
+    `config`: values for JSON. `note`: further entries of ``run.json``, which are not compared. Raises CompileError:
+    PD621 if the folder contains another run or other files, PD620 if its ``run.json`` is damaged, PD613 if it cannot be
+    written.
     """
     folder, plain = Path(path), json.loads(json.dumps(config))
     if (folder / ABOUT).exists():
@@ -281,9 +281,9 @@ def open_run(
 
 @contextmanager
 def lock_folder(folder: Path, patience: float = 0.0) -> Iterator[None]:
-    """Keep other processes from writing to a folder, after waiting for them for `patience` seconds.
+    """Lock a folder against other processes, after waiting for them for up to `patience` seconds.
 
-    The lock of a process that dies is gone with it. Raises CompileError: PD622 if another process has it, PD613 if the
+    The lock of a process ends with it. Raises CompileError: PD622 if another process has it, PD613 if the
     folder cannot be written to.
     """
     check_folder(folder)
@@ -299,20 +299,20 @@ def lock_folder(folder: Path, patience: float = 0.0) -> Iterator[None]:
 
 
 def new_folder(folder: Path) -> None:
-    """Make a folder for something that will be written there, unless it is there and empty.
+    """Create a folder for output, unless it exists and is empty.
 
-    Raises CompileError: PD621 where it holds files, PD613 where it cannot be made.
+    Raises CompileError: PD621 if it contains files, PD613 if it cannot be created.
     """
     with writing(folder):
         folder.mkdir(parents=True, exist_ok=True)
         others = sorted(name for name in os.listdir(folder) if not name.startswith("."))
     if others:
-        notes, helps = (f"such as {others[0]}",), ("choose a folder that is empty or not there yet",)
+        notes, helps = (f"such as {others[0]}",), ("choose a folder that is empty or does not exist",)
         raise failure("PD621", f"{folder} holds other files", notes=notes, helps=helps)
 
 
 def read_run(path: str | Path, kind: str | None = None) -> RunFolder:
-    """An existing run. Raises CompileError (PD620) if there is none, it is damaged, or of another kind than `kind`."""
+    """An existing run. Raises CompileError (PD620) if there is none, it is damaged, or its kind is not `kind`."""
     folder = Path(path)
     if not (folder / ABOUT).exists():
         raise not_a_run(folder, f"it has no {ABOUT}" if folder.is_dir() else "there is no such folder")
@@ -339,7 +339,7 @@ def find_run(text: str | Path | RunFolder, kind: str | None = None) -> RunFolder
 
 
 def check_folder(folder: Path) -> None:
-    """Refuse a folder that may come from a stranger and has links that lead out of it. Raises CompileError (PD112)."""
+    """Reject an untrusted folder with links that lead out of it. Raises CompileError (PD112)."""
     try:
         check_links(folder)
     except OSError as error:
@@ -348,13 +348,13 @@ def check_folder(folder: Path) -> None:
 
 
 def misfit(folder: Path, *why: str, helps: tuple[str, ...] = ()) -> CompileError:
-    """The error for a run whose model or data was made for something else (PD623)."""
+    """The error for a run whose model or data does not fit (PD623)."""
     return failure("PD623", f"{folder} does not fit", notes=why, helps=helps)
 
 
 @contextmanager
 def reporting_misfits(path: Path, what: str) -> Iterator[None]:
-    """Report errors of the block, in which a checkpoint with any contents is given to a model, as PD623."""
+    """Report errors of the block, which loads a checkpoint with any contents into a model, as PD623."""
     try:
         yield
     except (RuntimeError, TypeError, ValueError, AttributeError, LookupError) as error:
@@ -362,17 +362,17 @@ def reporting_misfits(path: Path, what: str) -> Iterator[None]:
 
 
 def not_a_run(folder: Path, why: str, helps: tuple[str, ...] = ()) -> CompileError:
-    """The error for a folder that is not a run, or one that cannot be used (PD620)."""
+    """The error for a folder that is not a usable run (PD620)."""
     return failure("PD620", f"{folder} is not a run that can be used here", notes=(why,), helps=helps)
 
 
 def write_json(path: Path, value: Any) -> None:
-    """Write a value as JSON, a file whole or not at all. Raises CompileError (PD613)."""
+    """Write a value as JSON, atomically. Raises CompileError (PD613)."""
     write_text(path, json.dumps(value, indent=1, ensure_ascii=False) + "\n")
 
 
 def differences(there: Mapping[str, Any], here: Mapping[str, Any]) -> tuple[str, ...]:
-    """The settings that differ, by dotted names, each with both values. Thirty at most."""
+    """The differing settings, at most thirty, by dotted names, each with both values."""
     there, here = _flat(there), _flat(here)
     names = [name for name in sorted({*there, *here}) if there.get(name) != here.get(name)]
     return tuple(
@@ -408,7 +408,7 @@ def check_palette(
 ) -> None:
     """Compare the slots of a run's network with the elements of some rules, qualified names by id.
 
-    Raises CompileError (PD623), with every element that has no slot, or whose slot is another's. `helps` are for the
+    Raises CompileError (PD623) with every element without a slot, or whose slot belongs to another. `helps` are for the
     first.
     """
     why, lacking = [], 0
@@ -419,5 +419,5 @@ def check_palette(
         elif palette[number] not in (None, name):
             why.append(f"id {number} is `{palette[number]}` there, `{name}` here")
     if why:
-        more = f"train with `--slots {len(palette) + lacking}` to leave room for packs that come later"
+        more = f"train with `--slots {len(palette) + lacking}` to leave room for packs added later"
         raise misfit(folder, *why, helps=(more, *helps) if lacking else ())

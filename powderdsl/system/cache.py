@@ -29,15 +29,15 @@ T = TypeVar("T")
 NAME = re.compile(r"([0-9a-f]+)-([0-9a-f]{64})-(.+)")
 
 LIMIT = 512 << 20
-"""Bytes of files to keep; beyond that, those used longest ago are removed."""
+"""Maximum bytes of files; above it, the least recently used are removed."""
 
 MOST = 2000
-"""The most files to keep, so that searching the folder stays quick."""
+"""Maximum number of files, so that searching the folder stays fast."""
 
 STORED = sys.platform != "emscripten"
 """Whether results of stages are stored: files do not outlive a page, and editors make new ones with each key."""
 QUICK = 0.002
-"""Results that took at most this many seconds are not stored."""
+"""Results that took fewer seconds are not stored."""
 
 UNUSED = 24 * 3600.0
 """Seconds after which other files are removed; until then another process may be at work on them."""
@@ -70,11 +70,11 @@ def code_hash() -> str:
 def persistent(name: str, inputs: str, make: Callable[[], T]) -> T:
     """The result of `make`, from the cache if an earlier process made it with the same code.
 
-    Exceptions are not stored, nor what was made quickly. A cache that cannot be read or written only costs time.
+    Exceptions and quick results are not stored. A cache that cannot be read or written only costs time.
 
     Args:
         name: what the result is; each stage has names of its own.
-        inputs: a text that differs wherever results of the stage differ.
+        inputs: a text that determines the result of the stage.
         make: returns the result, which can be pickled.
     """
     if not STORED:
@@ -84,7 +84,7 @@ def persistent(name: str, inputs: str, make: Callable[[], T]) -> T:
     with suppress(OSError):
         path = find(compiled_folder(), key)
         if path is not None:
-            # Whoever can write into the folder can also replace libraries, so a pickle is as safe as they are.
+            # Anyone who can write to the folder could also replace libraries, so pickles are as safe as those.
             return pickle.loads(read_bytes(path, LIMIT))
     start = time.process_time()
     result = make()
@@ -134,7 +134,7 @@ def entries(folder: Path) -> list[Entry]:
 
 
 def clear(folder: Path) -> list[Entry]:
-    """Remove all files of the cache, and return them. Builds in progress belong to other processes."""
+    """Remove and return all files of the cache, except builds in progress in other processes."""
     removed = entries(folder)
     tidy(folder, limit=-1)
     return removed
@@ -165,7 +165,7 @@ def tidy(folder: Path, limit: int = LIMIT, keep: Path | None = None) -> None:
 
 
 def _discard(path: Path) -> None:
-    """Remove a file or a folder, if that is possible."""
+    """Remove a file or a folder, if possible."""
     with suppress(OSError):
         if path.is_dir() and not path.is_symlink():
             shutil.rmtree(path, ignore_errors=True)
@@ -179,14 +179,14 @@ _MISSING: Any = object()
 
 
 class Memo:
-    """A cache of results by their inputs: for each thing, such as a file, the results of its last few versions.
+    """A cache of results by input: for each thing, such as a file, the results of its last few versions.
 
-    For programs that compile again and again: an editor, a page, a watcher of files. A memo never changes a function's
-    result. Threads may share one: two of them may compute the same result at once.
+    For programs that compile repeatedly, such as an editor, a page, or a file watcher. A memo never changes a
+    function's result. Threads may share one: two of them may compute the same result at once.
 
     Args:
-        versions: the most versions of each thing.
-        things: the most things; the least recently used are dropped.
+        versions: maximum number of versions of each thing.
+        things: maximum number of things; the least recently used are dropped.
     """
 
     def __init__(self, versions: int = 4, things: int = 4000):
@@ -194,7 +194,7 @@ class Memo:
         self._results: dict[Hashable, dict[Hashable, Any]] = {}
 
     def of(self, thing: Hashable, version: Hashable, make: Callable[[], T]) -> T:
-        """The result for a version of a thing, computed by `make` if it is not known. Exceptions are not kept."""
+        """The result for a version of a thing, computed by `make` if it is not cached. Exceptions are not cached."""
         # Each line below is one operation on a dict, which threads see done or not done. There is no lock, which a
         # fork could copy while another thread holds it.
         results = self._results.setdefault(thing, {})

@@ -1,7 +1,7 @@
 """Signals that ask a process to end: Ctrl-C, SIGTERM, and SIGHUP of a terminal that is closed.
 
 A command ends through exceptions, so that every `finally` runs: KeyboardInterrupt for Ctrl-C, its subclass `Terminated`
-for the others. Nothing here is installed by importing it; a library leaves signals alone.
+for the others. Importing this module installs nothing, since a library should not handle signals.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ REPEATED = 2.0
 """Seconds in which the same SIGTERM or SIGHUP counts once: `timeout` sends two."""
 
 LIFELINE = "POWDERDSL_LIFELINE"
-"""Environment variable of processes that end when their stdin is closed, whose other end their starter holds."""
+"""Environment variable of processes that end when their stdin, held open by their starter, is closed."""
 
 GRACE = 30.0
 """Seconds that such a process has for its last checkpoint."""
@@ -40,7 +40,7 @@ class Terminated(KeyboardInterrupt):
 
 @contextmanager
 def interruptible() -> Iterator[None]:
-    """Raise Terminated in the main thread for SIGTERM and SIGHUP, unless somebody else handles or ignores them."""
+    """Raise Terminated in the main thread for SIGTERM and SIGHUP, unless they are already handled or ignored."""
 
     def terminate(number: int, frame: FrameType | None) -> None:
         raise Terminated(number)
@@ -51,7 +51,7 @@ def interruptible() -> Iterator[None]:
 
 @contextmanager
 def delay_signal() -> Iterator[Callable[[], bool]]:
-    """Hold the first signal back until the end of the block, which raises then; a second one raises at once.
+    """Defer the first signal to the end of the block; a second one raises immediately.
 
     Yields a function that says whether one has come. Threads other than the main one receive no signals.
     """
@@ -71,7 +71,7 @@ def delay_signal() -> Iterator[Callable[[], bool]]:
 
 
 def end_with_stdin() -> None:
-    """End this process, as after SIGTERM, when its stdin is closed, because the process that started it has ended."""
+    """End this process, as after SIGTERM, when its stdin is closed because its parent has ended."""
 
     def watch() -> None:
         while os.read(0, 1 << 10):

@@ -1,4 +1,4 @@
-"""Imports that wait until they are needed: of packages that only some work needs, and of our own modules."""
+"""Lazy imports of optional packages and of our own modules."""
 
 from __future__ import annotations
 

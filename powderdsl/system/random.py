@@ -1,4 +1,4 @@
-"""Counter-based random numbers: hashes of a draw's inputs. No generator, no state; needs torch only for tensors.
+"""Counter-based random numbers: hashes of a draw's inputs, without state. Needs torch only for tensors.
 
 The reference (`model.reference`) has its own, which these are compared with.
 """
@@ -15,7 +15,7 @@ START_0, START_1 = 0x243F6A88, 0x85A308D3
 
 
 def name_number(name: str) -> int:
-    """The number under which a name enters the hash: FNV-1a, 32 bits. It is the same wherever the name stands."""
+    """The hash of a name, FNV-1a with 32 bits."""
     number = 0x811C9DC5
     for byte in name.encode():
         number = (number ^ byte) * 0x01000193 & MASK

@@ -1,4 +1,4 @@
-"""Files that may come from strangers: reading them within bounds, and confining the paths that they name to their folders.
+"""Untrusted files: reading them within limits, and confining the paths that they name to their folders.
 
 Every loader reads through `open_regular` or `read_bytes`. Every path that a file names goes through `inside`, every
 folder that is one thing (a run, a dataset, the results of a study) through `check_links`.
@@ -19,14 +19,14 @@ from typing import Any
 def open_regular(path: str | Path) -> BufferedReader:
     """Open a regular file for reading, also through links.
 
-    Raises OSError if it cannot be opened, or is no regular file.
+    Raises OSError if it cannot be opened or is not a regular file.
     """
     check_regular(path)
     return open(path, "rb")
 
 
 def check_regular(path: str | Path) -> None:
-    """Refuse a folder, and pipes and devices, which may have no end.
+    """Reject folders, and pipes and devices, which may be endless.
 
     Raises OSError if there is no regular file; `strerror` says why.
     """
@@ -54,8 +54,8 @@ def parse_json(
 ) -> Any:
     """The value of a JSON text. `hook` makes a value of each object, as `json.loads` takes it.
 
-    Raises ValueError if it is not JSON, is nested too deep, or holds more values: each takes up to a hundred times as
-    much memory as text.
+    Raises ValueError if it is not JSON, is nested too deeply, or has too many values, each of which takes up to a
+    hundred times the memory of its text.
     """
     if data.count(b",") + data.count(b"[") + data.count(b"{") > values:
         raise ValueError(f"it has more than {values:,} values")
@@ -77,9 +77,9 @@ def read_json(path: str | Path, limit: int = 1 << 22) -> Any:
 
 
 def inside(folder: str | Path, name: str) -> Path:
-    """The path of a file that a text names: relative to `folder`, and in it or below, also once links are followed.
+    """The path of a file named in a text, relative to `folder`, and inside it even after following links.
 
-    Raises ValueError if the path leads elsewhere; the text says why.
+    Raises ValueError with the reason if the path leads elsewhere.
     """
     if any(ord(char) < 32 or ord(char) == 127 for char in name):
         raise ValueError("it has control characters")
@@ -111,7 +111,7 @@ def is_path(word: str) -> bool:
 
 
 def check_links(folder: str | Path) -> None:
-    """Refuse a folder with links that lead out of it: writes to them would land elsewhere.
+    """Reject a folder with links that lead out of it, since writes to them would end up elsewhere.
 
     Raises OSError if there is such a link, or the folder cannot be listed; `filename` says which.
     """

@@ -40,7 +40,8 @@ def _width(cell: str) -> int:
 
 
 def as_json(value: Any) -> str:
-    """Indented JSON. A dataclass is an object: a key for each field, without the `_` that ends a field such as `from_`."""
+    """Indented JSON. A dataclass becomes an object with a key for each field, without the final `_` of a field such as
+    `from_`."""
     import json
 
     return json.dumps(value, indent=2, ensure_ascii=False, default=_json_value)

@@ -1,4 +1,4 @@
-"""Dataclasses whose fields declare which values they take: settings of runs, and records in files of strangers; and
+"""Dataclasses whose fields declare allowed values, for settings of runs and records in untrusted files; and
 fingerprints of dataclasses.
 
 Checks, the reader of records and the options of commands (`cli.options.settings_of`) follow from the declarations. The
@@ -24,7 +24,7 @@ from powderdsl.diagnostics import with_suggestion
 Record = TypeVar("Record")
 
 MAX_TEXT = 500
-"""Characters of a text in a record."""
+"""Maximum number of characters of a text in a record."""
 
 
 @dataclass(frozen=True)
@@ -37,11 +37,11 @@ class Limits:
     pattern: str = f"(?s:.{{1,{MAX_TEXT}}})"
     """A regular expression that texts match."""
     form: str = "a text"
-    """What such texts are called."""
+    """A noun for such texts."""
     keys: str = f".{{1,{MAX_TEXT}}}"
     """A regular expression that the keys of a mapping match."""
     length: tuple[int, int] = (0, 10_000)
-    """The least and most values of a list or a mapping."""
+    """The minimum and maximum number of values of a list or a mapping."""
 
 
 def setting(
@@ -59,7 +59,8 @@ def setting(
 
     Args:
         default: a value, or a type that makes one, such as `dict`.
-        about: the help of its option; without it there is none. option: the option's name, unless it is the field's.
+        about: the help of its option; without it, there is no option. option: the option's name, by default the
+            field's.
         low, high, choices, form: see `Limits`.
         may_change: allow a run to be resumed with another value.
     """
@@ -78,13 +79,13 @@ def check_count(name: str, value: Any, most: int, *, least: int = 1) -> None:
 
 
 def check_choice(name: str, value: Any, choices: Sequence[str]) -> None:
-    """Raise ValueError if an argument is none of some texts."""
+    """Raise ValueError if an argument is not one of some texts."""
     if value not in choices:
         raise ValueError(f"{name} is one of {', '.join(choices)}; found {value!r}")
 
 
 def check_settings(config: Any) -> None:
-    """Raise ValueError with a sentence for each setting whose value it does not take."""
+    """Raise ValueError with a sentence for each invalid setting."""
     problems: list[str] = []
     for name, (hint, _) in _fields_of(type(config)).items():  # type: ignore[arg-type]  # types are hashable
         if get_origin(hint) is Annotated:
@@ -94,9 +95,9 @@ def check_settings(config: Any) -> None:
 
 
 def read_record(kind: type[Record], data: Any, problems: list[str], path: str = "") -> Record | None:
-    """The record that a file describes, or None after adding everything that is wrong to `problems`.
+    """The record in a file, or None after adding all mistakes to `problems`.
 
-    `path`: the place of `data` in its file, such as ``shards[3]``, with which problems name places.
+    `path`: the location of `data` in its file for messages, such as ``shards[3]``.
     """
     if not isinstance(data, Mapping):
         problems.append(f"`{path or 'file'}` must be a mapping, found {data!r:.80}")
@@ -114,7 +115,7 @@ def read_record(kind: type[Record], data: Any, problems: list[str], path: str = 
 
 
 def checked_record(kind: type[Record], data: Any, path: str = "") -> Record:
-    """The record that a file describes. Raises ValueError with what is wrong."""
+    """The record in a file. Raises ValueError with all mistakes."""
     problems: list[str] = []
     record = read_record(kind, data, problems, path)
     if record is None:
@@ -193,15 +194,15 @@ def _check(kind: Any, value: Any, limits: Limits) -> tuple[bool, str]:
 # Fingerprints: equal models have equal ones, in every process and on every machine
 
 UNMEANING = MappingProxyType({"meaning": False})
-"""Metadata of dataclass fields that change nothing about what happens: texts, colors, tests."""
+"""Metadata of dataclass fields that do not affect behavior: texts, colors, tests."""
 
 
 def fingerprint(model: object, *, whole: bool = False) -> str:
     """64 hexadecimal digits for a value made of frozen dataclasses, tuples, frozen sets, numbers and text.
 
-    Fields that take no part in comparisons, such as places in files, take none here, nor do those with `UNMEANING` as
-    metadata; if `whole` is true, all do. A field at its default counts as absent, so that new fields change no
-    fingerprint. The names of classes and fields are part of it. Raises TypeError for anything else.
+    Fields excluded from comparison, such as locations in files, and those with `UNMEANING` as metadata are ignored,
+    unless `whole` is true. A field at its default counts as absent, so that new fields do not change fingerprints. The
+    names of classes and fields are included. Raises TypeError for anything else.
     """
     known: dict[int, tuple[object, str]] = {}  # shared parts are many: once each
     return _digest(model, known, whole)

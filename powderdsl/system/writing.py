@@ -1,4 +1,4 @@
-"""Writing files whole or not at all, the user's private cache, and errors about files. `system.reading` reads them."""
+"""Atomic writing of files, the user's private cache, and errors about files."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from powderdsl.diagnostics import CompileError, Diagnostic, Label
 from powderdsl.system.reading import check_regular
 
 MARK = ".powderdsl-"
-"""What names of temporary files have in them."""
+"""A part of the names of temporary files."""
 
 
 def failure(
@@ -26,13 +26,13 @@ def failure(
 
 @contextmanager
 def replacing(path: Path, *, follow: bool = False) -> Iterator[Path]:
-    """A temporary path beside `path`, with its suffix, that replaces it when the block succeeds.
+    """A temporary path in the folder of `path`, with its suffix, that replaces it when the block succeeds.
 
-    When the block fails or is interrupted, nothing is left and an older file stays as it was. Raises CompileError (PD613)
-    if the file cannot be written, by the block itself too.
+    If the block fails or is interrupted, the temporary file is removed and an older file is unchanged. Raises
+    CompileError (PD613) if the file cannot be written, by the block itself too.
 
-    `follow`: for paths that the user named: a link stays a link, and the file that it leads to is replaced. Otherwise
-    the link itself is replaced, which may come from a stranger's folder.
+    `follow`: replace the target of a link, for paths named by the user. By default, the link itself is replaced, since
+    it may be in an untrusted folder.
     """
     target = destination(path, follow=follow)
     temporary = target.parent / f".{target.stem[:40]}{MARK}{token_hex(8)}{target.suffix}"
@@ -64,7 +64,7 @@ def writing(path: Path) -> Iterator[None]:
 
 @contextmanager
 def scratch_folder(parent: Path) -> Iterator[Path]:
-    """An empty folder in `parent` that only its owner can read, removed at the end with all that it holds.
+    """An empty folder in `parent` that only its owner can read, removed with its contents at the end.
 
     Raises OSError if it cannot be made there.
     """
@@ -73,7 +73,7 @@ def scratch_folder(parent: Path) -> Iterator[Path]:
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write a text as UTF-8, whole or not at all, as `replacing` does. Raises CompileError (PD613)."""
+    """Write a text as UTF-8, atomically, as `replacing` does. Raises CompileError (PD613)."""
     with replacing(path) as temporary:
         temporary.write_text(text, encoding="utf-8")
 
@@ -81,7 +81,7 @@ def write_text(path: Path, text: str) -> None:
 def destination(path: Path, *, follow: bool) -> Path:
     """The path that a write replaces: the path itself, or the target of a link.
 
-    Raises CompileError (PD613) if something else than a file is there, or links form a loop.
+    Raises CompileError (PD613) if something other than a file exists there, or links form a loop.
     """
     try:
         target = path.resolve() if follow and path.is_symlink() else path
@@ -93,15 +93,15 @@ def destination(path: Path, *, follow: bool) -> Path:
 
 
 def not_writable(path: Path, error: Exception) -> CompileError:
-    """PD613, with the reason that the system gave."""
+    """PD613, with the system's reason."""
     reason = getattr(error, "strerror", None) or str(error)
     return failure("PD613", f"cannot write {path}", notes=(reason,))
 
 
 def cache_folder(name: str) -> Path:
-    """A folder of the user's cache, made with mode 0700. Its contents are loaded and executed.
+    """A folder of the user's cache, created with mode 0700, since its contents are loaded and executed.
 
-    Raises OSError if it cannot be made, belongs to somebody else, or others may write to it; or there is no home
+    Raises OSError if it cannot be created, belongs to another user, or others may write to it; or there is no home
     folder.
     """
     try:
@@ -115,7 +115,7 @@ def cache_folder(name: str) -> Path:
 
 
 def check_private(folder: Path) -> None:
-    """Refuse a folder to which another user may write. Raises PermissionError."""
+    """Reject a folder to which another user may write. Raises PermissionError."""
     if not hasattr(os, "getuid"):
         return
     # A link is checked too: its owner decides where it leads.

@@ -1,6 +1,6 @@
-"""For testing rules: random start worlds, tests of packs, invariants, mutants.
+"""Testing rules: random start worlds, tests of packs, invariants, mutants.
 
-`worlds` is a strategy for Hypothesis, which nothing else here needs.
+`worlds` is a Hypothesis strategy; the rest does not need Hypothesis.
 """
 
 from __future__ import annotations

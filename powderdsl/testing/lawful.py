@@ -1,4 +1,4 @@
-"""Filters of universes: results of checking a universe, proving its claims and running it for a while."""
+"""Filters for universes: results of checking a universe, proving its claims and running it."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class Findings:
 
     @property
     def faults(self) -> list[str]:
-        """The filters that the universe does not pass, in words."""
+        """The filters that the universe fails, in words."""
         name, share = self.largest
         faults = [*self.remarks, *(f"not proven: {claim}" for claim in self.unproven)]
         faults += ["nothing moves"] * (not self.moved) + ["nothing reacts"] * (not self.reacted)
@@ -45,7 +45,7 @@ class Findings:
 
     @property
     def lines(self) -> list[str]:
-        """All of it in words, a finding a line."""
+        """All findings in words, one per line."""
         name, share = self.largest
         return [
             f"{len(self.remarks) or 'no'} remarks, {self.proven} claims proven",

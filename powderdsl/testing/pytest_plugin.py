@@ -1,7 +1,7 @@
 """Plugin for pytest: packs are collected like test files. Every test and every invariant of a pack is an item.
 
-`pytest rules/` runs them. A pack is tried in the ruleset beside it that lists it, so that packs which work together are
-tested together; otherwise with the packs that it needs.
+`pytest rules/` runs them. A pack is tested in the ruleset of its folder that lists it, so that packs are tested in
+combination; otherwise, with the packs that it needs.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 HEAD = re.compile(r"^(pack|ruleset):[ \t]*[A-Za-z_]\w*[ \t]*$", re.MULTILINE)
 
 WORLDS = 300
-"""Random worlds that each invariant is tried on; `powderdsl test` tries more."""
+"""Number of random worlds on which to try each invariant; `powderdsl test` tries more."""
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
@@ -29,12 +29,12 @@ def pytest_addoption(parser: pytest.Parser) -> None:
         "--powderdsl-worlds",
         type=int,
         default=WORLDS,
-        help="random worlds that each invariant of a pack is tried on",
+        help="number of random worlds on which to try each invariant of a pack",
     )
 
 
 def pytest_collect_file(file_path: Path, parent: pytest.Collector) -> PackFile | None:
-    """YAML files that start as packs and rulesets do. Other files are ignored."""
+    """Collect YAML files that start like packs and rulesets; other files are ignored."""
     is_pack = file_path.suffix in (".yaml", ".yml") and HEAD.search(_text(file_path))
     return PackFile.from_parent(parent, path=file_path) if is_pack else None
 
@@ -51,7 +51,7 @@ def _text(path: Path) -> str:
 
 
 def home_of(path: Path) -> str:
-    """The rules that a pack is tried in, as `powderdsl.load` takes them."""
+    """The rules to test a pack in, as for `powderdsl.load`."""
     text = _text(path)
     if re.search(r"^ruleset:", text, re.MULTILINE):
         return str(path)
@@ -134,7 +134,7 @@ class PackItem(pytest.Item):
                     self.fail("\n".join(counterexample_lines(outcome.counterexample, loaded(*self.home))))
 
     def fail(self, words: str) -> None:
-        """Fail with the place of the item and what is wrong."""
+        """Fail with the location of the item and the fault."""
         span = self.subject.span
         pytest.fail(f"{span.source.name}:{span.line}: {words}", pytrace=False)
 

@@ -1,1 +1,1 @@
-"""Studies: many runs of commands over a grid of settings, as data. One command gives the table and the figure."""
+"""Studies: runs of commands over a grid of settings, described as data, with a table and a figure."""

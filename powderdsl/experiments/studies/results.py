@@ -1,4 +1,4 @@
-"""Results over seeds: tables and figures of studies, whether their expectations held, and learning curves of runs."""
+"""Results over seeds: tables, figures and verdicts of studies, and learning curves of runs."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ from powderdsl.system.writing import replacing
 
 BASELINES = ("expert", "random", "nothing")
 DERIVED = ("fingerprint", "palette", "channels")
-"""Ends of the names of settings that follow from the task and its rules."""
+"""Suffixes of settings that follow from the task and its rules."""
 
 
 @dataclass(frozen=True)
 class Interval:
     """A mean over seeds, and the ends of its 95 % interval by Student's t: not finite for a single value.
 
-    On the scale ``log`` the mean is the geometric one, and the ends are as many times smaller and larger.
+    On the scale ``log``, the mean is geometric, and the ends are equal factors below and above it.
     """
 
     mean: float
@@ -69,7 +69,7 @@ def interval(samples: Sequence[float], scale: str = "linear") -> Interval:
 
 
 def findings(study: Study, outcomes: Sequence[Outcome]) -> list[Finding]:
-    """The findings from finished points. Combinations are in the order in which values were written."""
+    """The findings from finished points. Combinations are in the order of the values in the file."""
     finished = [outcome for outcome in outcomes if outcome.problem is None]
     finished.sort(key=lambda outcome: outcome.point.seed)
     measured = []
@@ -88,7 +88,8 @@ def findings(study: Study, outcomes: Sequence[Outcome]) -> list[Finding]:
 
 
 def _verdict(measure: Measure, label: str, cells: Sequence[Cell]) -> str:
-    """Tell whether a measure changes along cells as expected; empty if nothing is expected or no seed has both ends.
+    """A verdict on whether a measure changes along cells as expected; empty if nothing is expected or no seed has both
+    ends.
 
     The last value is compared with the first, seed by seed: by their difference, on the scale ``log`` by their ratio.
     """
@@ -119,7 +120,7 @@ def _lines(cells: Sequence[Cell]) -> dict[str, list[Cell]]:
 
 
 def as_data(study: Study, size: str, outcomes: Sequence[Outcome]) -> dict[str, Any]:
-    """All results, for JSON, which has no numbers that are not finite."""
+    """All results for JSON, without numbers that are not finite."""
     points = [
         {
             "values": dict(outcome.point.values),
@@ -179,7 +180,7 @@ def show_interval(number: Interval, scale: str = "linear") -> str:
 
 @dataclass(frozen=True)
 class Line:
-    """Samples at each of some places along an axis, in the order of their seeds. The label may be empty."""
+    """Samples at several positions along an axis, in the order of seeds. The label may be empty."""
 
     label: str
     places: Sequence[int]
@@ -232,7 +233,7 @@ def write_figure(path: Path, study: Study, size: str, outcomes: Sequence[Outcome
 
 
 def draw(path: Path, rows: Sequence[Sequence[Panel]], title: str, *, follow: bool = False) -> None:
-    """Draw rows of panels, with all samples as dots. The suffix of the path says which format is written.
+    """Draw rows of panels, with all samples as dots. The format follows from the suffix of the path.
 
     `follow`: write to where a link leads. Raises CompileError: PD612 without matplotlib, PD613 if the file cannot be
     written.
@@ -273,11 +274,11 @@ def draw(path: Path, rows: Sequence[Sequence[Panel]], title: str, *, follow: boo
         figure.savefig(temporary, dpi=150)
 
 
-# Learning curves of runs that differ only in their seed, against what they have learned from
+# Learning curves of runs that differ only in their seed, by training step
 
 
 def curves_of(runs: Sequence[RunFolder], metric: str) -> list[Line]:
-    """A curve for each group of runs that differ only in their seed, at the steps that all of a group have.
+    """A curve for each group of runs that differ only in their seed, at the steps common to the group.
 
     A label names the settings in which the groups differ. Runs without the metric are left out.
     """
@@ -305,7 +306,7 @@ def curves_of(runs: Sequence[RunFolder], metric: str) -> list[Line]:
 
 
 def baselines_of(runs: Sequence[RunFolder]) -> dict[str, float]:
-    """The mean returns of policies that need no training, in the held-out worlds: from the first run that was evaluated."""
+    """The mean returns of untrained policies in the held-out worlds, from the first evaluated run."""
     for run in runs:
         evaluation = read_json(run.path / EVALUATION)
         split = (read_json(run.path / "asked.json") or {}).get("eval_split", "test")

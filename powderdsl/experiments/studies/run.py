@@ -1,7 +1,7 @@
-"""Running a study: each point is a chain of commands in processes of their own. Finished steps are not repeated.
+"""Running a study: each point is a chain of commands in separate processes. Finished steps are not repeated.
 
-On Ray, each point is a task: Ray repeats the task of a node that dies, and a new driver repeats what is not done. The
-study's folder, on storage that all nodes share, holds all state.
+On Ray, each point is a task: Ray repeats the task of a node that dies, and a new driver repeats what is not done. All
+state is in the study's folder, on storage shared by all nodes.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ EVALUATION, ABOUT_STUDY = "evaluation.json", "study.json"
 
 @dataclass(frozen=True)
 class Outcome:
-    """A finished point: its measures by name, or the problem. `held`: the problem is that another process works on it."""
+    """A finished point: its measures by name, or the problem. `held`: another process is working on it."""
 
     point: Point
     values: Mapping[str, float]
@@ -61,9 +61,9 @@ class StudyRun:
         self._running: set[subprocess.Popen[bytes]] = set()
 
     def prepare(self) -> None:
-        """Make the folder, or resume in it. Values, seeds and measures may have changed, but no step.
+        """Create the folder, or resume in it. Values, seeds and measures may have changed, but steps may not.
 
-        Raises CompileError: PD621 where the folder holds another study or other files, PD613 where it cannot be written.
+        Raises CompileError: PD621 if the folder contains another study or other files, PD613 if it cannot be written.
         """
         path = self.folder / ABOUT_STUDY
         if self.folder.is_dir():
@@ -72,7 +72,7 @@ class StudyRun:
             if not path.exists():
                 new_folder(self.folder)
         except CompileError:
-            if not path.exists():  # else another process has just begun the same study
+            if not path.exists():  # otherwise, another process has just begun the same study
                 raise
         with lock_folder(self.folder, GRACE):
             if path.exists() and not self.is_prepared():
@@ -94,9 +94,9 @@ class StudyRun:
         *,
         patient: bool = False,
     ) -> list[Outcome]:
-        """Run points to their end, `jobs` at a time. Signals end all processes; the same call resumes them.
+        """Run points, `jobs` at a time. Signals end all processes; the same call resumes them.
 
-        `report` is called with each outcome. `patient`: wait for points that other processes work on.
+        `report` is called with each outcome. `patient`: wait for points that other processes are working on.
         """
         read, write = os.pipe()
         # Processes end when their stdin is closed: by us, or because we are killed.
@@ -104,7 +104,7 @@ class StudyRun:
             return run_all(lambda point: self._point(point, patient), points, jobs, report, self._end_all)
 
     def finished(self, point: Point) -> Outcome | None:
-        """The outcome of a point whose steps are done here; None if they are not."""
+        """The outcome of a point whose steps are done; None if they are not."""
         path = self.folder / "done" / f"{point.name}.json"
         evaluations = read_json(path)
         if not isinstance(evaluations, dict):

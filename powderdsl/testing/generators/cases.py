@@ -1,4 +1,4 @@
-"""Start worlds that are random in everything a world holds."""
+"""Start worlds that are random in all their state."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ FEW_CELLS = 12
 
 @dataclass(frozen=True)
 class Start:
-    """A batch of start worlds of one shape, free of any backend. Slots that `fields` lacks are fresh.
+    """A batch of start worlds of one shape, independent of backends. Slots missing in `fields` are fresh.
 
     `ids` is uint8 [B, H, W]. `seed`, `index` and `step`, int64 [B], are what random numbers depend on, as those of a
     `World`. `fields` are arrays by slot name, [B, H, W] or [B, 2, H, W]; `params` are float64 [B] by name, for all of

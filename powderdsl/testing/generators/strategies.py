@@ -20,10 +20,10 @@ def worlds(
     """Return a strategy for start worlds of a ruleset: any ids, fields and parameters it allows, in odd shapes.
 
     Args:
-        rules: a checked model, or a name as `powderdsl.load` takes it.
-        max_batch: the largest number of worlds.
-        max_side: the largest number of rows, and of columns.
-        shape: (worlds, rows, columns); unless given, it is drawn too.
+        rules: a checked model, or a name for `powderdsl.load`.
+        max_batch: the maximum number of worlds.
+        max_side: the maximum number of rows and of columns.
+        shape: (worlds, rows, columns); drawn by default.
     """
     ruleset = load(rules) if isinstance(rules, str) else rules
     return chosen(lambda choices: random_start(ruleset, choices, shape, max_batch, max_side))

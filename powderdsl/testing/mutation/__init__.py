@@ -1,1 +1,1 @@
-"""Mutation testing of packs: realistic mistakes, the checks that notice them, and worlds that show the survivors."""
+"""Mutation testing of packs: realistic mistakes, the checks that detect them, and worlds that expose survivors."""

@@ -1,1 +1,1 @@
-"""The tests that packs bring along."""
+"""Tests in packs."""

@@ -1,4 +1,4 @@
-"""Runs the tests that stand in packs: small worlds, and what must become of them."""
+"""Runs the tests in packs: small worlds and their expected futures."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from powderdsl.simulation.simulator import Simulator, World
 
 SEEDS = (0, 1, 2, 3, 4)
-"""Seeds of a test that names none: several, since a rule that depends on chance should not pass by luck."""
+"""Seeds of a test without a seed: several, so that a random rule does not pass by chance."""
 
 MOST = 8
 """Added packs that are left out in turn, to see which of them change what a test shows."""
@@ -52,12 +52,12 @@ class ExampleResult:
 
     @property
     def passed(self) -> bool:
-        """True if the worlds end as the test says, with all seeds."""
+        """True if the worlds end as expected with all seeds."""
         return not self.problem
 
     @property
     def failed(self) -> bool:
-        """True if the worlds end otherwise, and no added pack is the reason."""
+        """True if the worlds end otherwise, but not because of an added pack."""
         return bool(self.problem) and not self.added
 
 
@@ -72,8 +72,8 @@ def run_examples(
     more are loaded.
 
     Args:
-        sim: what runs them, instead of a new simulator of this ruleset on a backend that starts at once.
-        seen: called with the worlds of each test at its end.
+        sim: the simulator to use; by default, a new one on a backend that starts instantly.
+        seen: called with the final worlds of each test.
     """
     sim = sim or compile(ruleset, starting_backend("cpu"), tensors=False)
     results = [_result(example, sim, seen) for example in ruleset.tests]
@@ -91,7 +91,7 @@ def _added(result: ExampleResult, ruleset: Ruleset, sim: Simulator) -> tuple[str
 
 
 def _passes(example: Example, ruleset: Ruleset | None, sim: Simulator) -> bool:
-    """True if a test passes with other rules; False if they lack the test."""
+    """True if a test passes with other rules; False if they do not contain the test."""
     tests = [test for test in ruleset.tests if test.span == example.span] if ruleset is not None else []
     return ruleset is not None and any(_result(test, sim.of(ruleset), None).passed for test in tests)
 
@@ -116,7 +116,7 @@ def start_of(example: Example, sim: Simulator, *seeds: int) -> World:
 
 
 def _ids(example: Example, ruleset: Ruleset) -> dict[str, int]:
-    """The elements that a test's characters mean."""
+    """The elements of a test's characters."""
     ids = {element.name: element.id for element in ruleset.elements}
     return {char: ids[name] for char, name in example.legend}
 
@@ -235,7 +235,7 @@ def _word(rules: Ruleset, kind: Kind, value: NDArray[Any]) -> str:
 
 
 def _wanted(rules: Ruleset, kind: Kind, cell: Cell, fresh: NDArray[Any]) -> str:
-    """The value that a cell should hold, a range, or its default."""
+    """The expected value of a cell, a range, or its default."""
     if not cell:
         return f"{_word(rules, kind, fresh)}, its default"
     if kind.name not in ("int", "real", "vec2"):
@@ -283,7 +283,8 @@ def is_unlikely(hits: int, trials: int, chance: float) -> bool:
 
 
 def trials_for(chance: float) -> int:
-    """The number of trials that tell a chance from one that is off by OFF, in either direction, with ERROR_RATE both ways."""
+    """The number of trials needed to distinguish a chance from one that is off by OFF, with both errors below
+    ERROR_RATE."""
     small = min(chance, 1 - chance)
     if small <= 0:
         return ceil(log(1 / ERROR_RATE) / RARE)
@@ -296,7 +297,7 @@ def trials_for(chance: float) -> int:
 
 
 def chance_problem(start: World, example: Example, seed: int) -> str:
-    """A sentence about the first claim of a test that counts contradict, or nothing.
+    """A sentence about the first claim of a test that the counts contradict; empty if there is none.
 
     All copies of the one world `start` have the same seed, and each an index of its own.
     """

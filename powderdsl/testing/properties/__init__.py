@@ -1,1 +1,1 @@
-"""Invariants held against rules: proven where that is possible, else tested on worlds, broken ones made small."""
+"""Checking invariants: by proofs if possible, else on random worlds, with counterexamples made small."""

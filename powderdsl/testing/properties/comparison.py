@@ -1,4 +1,4 @@
-"""Two rulesets, compared: proven equal, or told apart by a small world."""
+"""Comparison of two rulesets: a proof that they are equivalent, or a small world on which they differ."""
 
 from __future__ import annotations
 

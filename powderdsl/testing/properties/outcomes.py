@@ -225,7 +225,7 @@ def result_data(result: Result) -> dict[str, Any]:
 
 
 FOLDER = ".powderdsl"
-"""Where counterexamples are kept, under the working directory."""
+"""The folder of counterexamples in the working directory."""
 
 
 def file_of(rules: str, prop: Property) -> Path:
@@ -267,7 +267,7 @@ def read_example(path: Path, ruleset: Ruleset) -> tuple[str, Start, int]:
 def kept_examples(
     ruleset: Ruleset, properties: Mapping[str, Property], rules: str
 ) -> Iterator[tuple[Property, Start, int]]:
-    """The counterexamples that were kept for these rules. Files that no longer fit are passed over."""
+    """The stored counterexamples for these rules. Files that no longer fit are skipped."""
     for prop in properties.values():
         path = file_of(rules, prop)
         if path.is_file():

@@ -1,4 +1,4 @@
-"""Runs start worlds and keeps what they were after each step, and which lines of rules happened meanwhile."""
+"""Runs start worlds, and records their state after each step and the lines of rules that fired."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ MARK = "happened "
 class Runner:
     """Runs a ruleset on one backend. `happened` collects the lines of rules that changed or claimed some cell.
 
-    `sim`: one that exists already, which sets no flags: then no line is known to happen.
+    `sim`: an existing simulator, which sets no flags, so that no fired lines are recorded.
     """
 
     def __init__(self, ruleset: Ruleset, backend: str | None = None, sim: Simulator | None = None):
@@ -58,7 +58,7 @@ class Runner:
         return history
 
     def note(self, state: Mapping[str, Any]) -> None:
-        """Remember which lines happened on the way to this state of `sim`."""
+        """Record which lines fired on the way to this state of `sim`."""
         for number, span in enumerate(self.lines):
             if span not in self.happened and bool(state[f"{MARK}{number}"].any()):
                 self.happened.add(span)

@@ -1,4 +1,4 @@
-"""Proves what can be proven of a ruleset's properties, and tests the rest on random worlds."""
+"""Proves a ruleset's properties if possible, and tests the others on random worlds."""
 
 from __future__ import annotations
 
@@ -134,7 +134,7 @@ class InvariantSearch:
         return replace(self, trials=list(map(replace, trials)))
 
     def try_random(self) -> None:
-        """Try random worlds until there are enough of them, or time is up."""
+        """Try random worlds up to their number or the time limit."""
         until = monotonic() + self.plan.seconds
         for number, sample in enumerate(
             random_samples(self.runner.ruleset, self.plan.seed, self.plan.examples)
