@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 from powderdsl.system.packages import importing
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 
 if TYPE_CHECKING:
     from powderdsl.analysis.ledger import ledger

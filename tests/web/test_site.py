@@ -170,14 +170,15 @@ def test_the_archive_has_what_the_bridge_imports() -> None:
     root = PAGE.parents[1]
 
     def imported(path: Path) -> set[Path]:
-        """The files of modules that one imports anywhere."""
+        """The files of modules that one imports anywhere, but for those that only `Workspace.check` and schemas need."""
         names = set()
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
             if isinstance(node, ast.ImportFrom) and node.module:
                 names |= {node.module, *(f"{node.module}.{alias.name}" for alias in node.names)}
         places = [root.parent.joinpath(*name.split(".")) for name in names if name.startswith("powderdsl")]
         files = {place.with_suffix(".py") for place in places} | {place / "__init__.py" for place in places}
-        return {file for file in files if file.is_file()}
+        unused = ("tasks", "experiments") if path.parent.name == "editing" else ()
+        return {file for file in files if file.is_file() and file.relative_to(root).parts[0] not in unused}
 
     waiting, needed = [PAGE.parent / "bridge.py"], set[Path]()
     while waiting:
