@@ -98,8 +98,8 @@ def test_invalid_values_of_a_recipe_are_refused(key: str, value: Any, folder: Pa
 ROWS: list[tuple[Callable[[Any], Any], str]] = [
     (lambda rows: rows[0].update(file="/etc/passwd"), "unknown key `shards[0].file`"),
     (lambda rows: rows[0].update(number="../secret"), "`shards[0].number` must be an integer"),
-    (lambda rows: rows[0].update(number=7), "there is no shard 7"),
-    (lambda rows: rows[0].update(number=1), "comes twice"),
+    (lambda rows: rows[0].update(number=7), "shard 7 does not exist"),
+    (lambda rows: rows[0].update(number=1), "is repeated"),
     (lambda rows: rows[0].update(transitions=10**9), "cannot have 1000000000 transitions"),
     (lambda rows: rows[0].update(bytes=10**15), "`shards[0].bytes` must be an integer"),
     (lambda rows: rows[0].update(bytes=5), "its size or its SHA-256"),
@@ -190,8 +190,8 @@ CONTENTS: list[tuple[Callable[[Arrays], Any], str]] = [
     (lambda a: first(a, "world", -1), "worlds out of range"),
     (lambda a: first(a, "length", 0), "lengths of its episodes"),
     (lambda a: first(a, "length", 1 << 30), "lengths of its episodes"),
-    (lambda a: first(a, "terminated", True), "do not end where"),
-    (lambda a: a["truncated"].fill(True), "do not end where"),
+    (lambda a: first(a, "terminated", True), "recorded lengths"),
+    (lambda a: a["truncated"].fill(True), "recorded lengths"),
     (lambda a: a.update(observation=a["observation"][:-1]), "`observation` is"),
     (lambda a: a.update(reward=a["reward"][:-1]), "`reward` is"),
 ]
@@ -216,8 +216,8 @@ MEMBERS: list[tuple[str, bytes, str]] = [
     ("world.npy", npy("'<i8'", "__import__('os').abort()", bytes(64)), "`world` is not an array of numbers"),
     ("world.npy", EIGHT[:-8], "56 bytes, not 64"),
     ("world.npy", b"not numpy", "`world` is not an array"),
-    ("../world.npy", EIGHT, "and nothing else"),
-    ("extra.npy", EIGHT, "and nothing else"),
+    ("../world.npy", EIGHT, "must contain exactly"),
+    ("extra.npy", EIGHT, "must contain exactly"),
 ]
 
 

@@ -201,7 +201,7 @@ STRANGER = {"id": "any-v0", "entry_point": "pathlib:Path.touch", "kwargs": {"sel
         (swapped("infos/world", lambda file, group, old: group.attrs.pop("seed")), "episode_1: "),
         (value("actions", 99), "actions out of range"),
         (value("observations", 200), "ids that the palette lacks"),
-        (value("terminations", True), "do not end"),
+        (value("terminations", True), "do not have the recorded lengths"),
     ],
 )  # fmt: skip
 def test_damaged_minari_datasets_are_refused(

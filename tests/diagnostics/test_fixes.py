@@ -29,7 +29,7 @@ MISTAKES = [
     ("ant -> empty 50%", "50%", "write `with chance 50%`", "ant -> empty with chance 50%"),
     ("ant -> empty with probability 50%", "probability", "write `with chance`", "ant -> empty with chance 50%"),
     ("ant -> empty with chance 5", "5", "did you mean `5%`?", "ant -> empty with chance 5%"),
-    ("ant -> empty if random() < 0.5", "random", "say `with chance 5%` at the end of the rule", "ant -> empty with chance 5%"),
+    ("ant -> empty if random() < 0.5", "random", "write `with chance 5%` at the end of the rule", "ant -> empty with chance 5%"),
     ("ant -> empty if count(age > 0 in ring) > 1", "in", "`count((CONDITION) in ring)`", "ant -> empty if count((age > 0) in ring) > 1"),
     ("ant -> empty if count(empty) in disc(3) > 4", ">", "`count(SET in ring)`", "ant -> empty if count(empty in disc(3)) > 4"),
     ("ant -> empty if sum(age) > 3 of ring", "of", "`sum(SET in ring)`", "ant -> empty if sum(age in ring) > 3"),
@@ -59,9 +59,9 @@ MISTAKES = [
     ("age := age + 1 if ant", "\n", "`field := value where condition`", "age := age + 1 where ant"),
     ("set age to 3 where ant", "age", "write `age := VALUE where …`", "age := 3 where ant"),
     ("ant -> empty, age := 0", "age", "`…, then field := value`", "ant -> empty, then age := 0"),
-    ("ant -> empty if age > 200", "ant -> empty if age > 200", "change the conditions", "ant -> empty if age > 99"),
-    ("ant -> empty if density > 10 and left is empty", "ant -> empty if density > 10 and left is empty", "change the conditions", "ant -> empty if density > 1 and left is empty"),
-    ("ant -> empty if count(ant) > 9", "ant -> empty if count(ant) > 9", "change the conditions", "ant -> empty if count(ant) > 8"),
+    ("ant -> empty if age > 200", "ant -> empty if age > 200", "change the underlined conditions", "ant -> empty if age > 99"),
+    ("ant -> empty if density > 10 and left is empty", "ant -> empty if density > 10 and left is empty", "change the underlined conditions", "ant -> empty if density > 1 and left is empty"),
+    ("ant -> empty if count(ant) > 9", "ant -> empty if count(ant) > 9", "change the underlined conditions", "ant -> empty if count(ant) > 8"),
     ("ant -> empty if count(antt) > 2", "antt", "did you mean `ant`?", "ant -> empty if count(ant) > 2"),
     ("ant -> empty if count(fire) > 2", "fire", "or write `fire?`", "ant -> empty if count(fire?) > 2"),
     ("ant -> empty if interacts < 5%", "interacts", "did you mean `interact`?", "ant -> empty if interact < 5%"),
@@ -97,4 +97,4 @@ def test_conditions_that_exclude_each_other_are_underlined(tmp_path: Path) -> No
     assert [label.span.text for label in found.secondary] == ["left is wall", "left is (sand, empty)"]
     (found,) = diagnosed("ant -> empty if age > 200 and left is wall", tmp_path)
     assert [label.span.text for label in found.secondary] == ["age > 200"]
-    assert found.notes == ("`age` lies in 0..100",)
+    assert found.notes == ("`age` is in 0..100",)

@@ -144,7 +144,7 @@ def test_infos_have_masks_where_asked_for(small: TaskProgram, kind: str) -> None
 def test_bad_actions_name_what_is_wrong(small: TaskProgram, task_file: Path) -> None:
     env = TensorEnv(varied(small, task_file, "[sand, nothing]"), 2, actions="multidiscrete")
     env.reset(seed=0)
-    with pytest.raises(ValueError, match=r"actions\[1, 2\] \(choice\) is 2: it must lie in 0\.\.1"):
+    with pytest.raises(ValueError, match=r"actions\[1, 2\] \(choice\) is 2: it must be in 0\.\.1"):
         env.step([[0, 0, 0], [0, 0, 2]])
     with pytest.raises(ValueError, match=r"shape \[episodes, 3\], found \[2, 5\]"):
         env.step([[0] * 5] * 2)

@@ -116,8 +116,8 @@ def test_c_does_the_same_as_python(request, tmp_path, task, observation, actions
 def test_what_does_not_fit_is_refused(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     for words, message in [
-        (["sand-pushing", "--out", "e.wasm", "--env"], "--env writes a .h file"),
-        (["life", "--out", "e.h"], "--env writes a .h file"),
+        (["sand-pushing", "--out", "e.wasm", "--env"], "--env, writes a .h file"),
+        (["life", "--out", "e.h"], "--env, writes a .h file"),
         (["--env", "sand-pushing", "--out", "e.h", "--size", "8"], "--size goes with rules"),
         (["--env", "nothing-such", "--out", "e.h"], "nothing-such"),
     ]:

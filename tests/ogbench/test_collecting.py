@@ -167,11 +167,11 @@ def test_missing_and_damaged_data_are_named(data: Path, tmp_path: Path) -> None:
             path.write_bytes(damage)
         else:
             np.savez(path, **damage)
-        with pytest.raises(ValueError, match=r"damaged\.npz is not a data set"):
+        with pytest.raises(ValueError, match=r"damaged\.npz is not a dataset"):
             load_dataset(path)
     with zipfile.ZipFile(path, "w") as archive:
         archive.writestr("observations.npy", b"\x93NUMPY\1\0 ")
-    with pytest.raises(ValueError, match="is not a data set"):
+    with pytest.raises(ValueError, match="is not a dataset"):
         load_dataset(path)
 
 

@@ -100,7 +100,7 @@ def test_what_cannot_be_imitated_is_refused(tmp_path: Path) -> None:
         return errors[0].message
 
     assert "no expert" in why("a", init_expert=2)
-    assert "both" in why("b", init_expert=2, init_from="data")
+    assert "cannot be combined" in why("b", init_expert=2, init_from="data")
     assert "`frames`" in why("c", init_expert=2, frames=2)
     assert "`matrix`" in why("d", init_expert=2, observation="matrix")
     assert not list(tmp_path.glob("?"))

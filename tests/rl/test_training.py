@@ -157,7 +157,7 @@ def test_presets_are_those_of_the_documentation() -> None:
     presets = [preset(name, "dig") for name in ("paper", "small", "fcn")]
     for label, names in {
         "learning rate, batch, epochs": ("learning_rate", "batch", "epochs"),
-        "actions in each between updates": ("rollout",),
+        "actions per world and update": ("rollout",),
         "entropy coefficient": ("entropy",),
     }.items():
         cells = [", ".join(f"{getattr(config, name):g}" for name in names) for config in presets]

@@ -91,7 +91,7 @@ def test_other_worlds_run_as_before(torch) -> None:  # type: ignore[no-untyped-d
 def test_of_two_assignments_the_last_holds() -> None:
     passes = "passes:\n  count:\n    do:\n      - age := 3 where wet\n      - age := 5 where hot\n"
     ruleset, (warning,) = load(passes, GEYSER)
-    assert any("stands last" in one for one in warning.notes)
+    assert any("the last assignment wins" in one for one in warning.notes)
     sim = powderdsl.compile(ruleset, backend="reference")
     world = sim.world([[[ruleset.element("geyser").id, 3, 4, 0]]])
     assert sim.step(world)["age"][0, 0].tolist() == [5, 3, 5, 0]
@@ -114,7 +114,7 @@ def test_where_a_policy_would_change_more_the_tag_is_an_error() -> None:
     )
     errors = [one for one in refused(moving, GEYSER) if one.code == "PD501"]
     assert [under_caret(one) for one in errors] == [("added.yaml", "wet")]
-    assert any("leave out `wet` or `hot`" in one for one in errors[0].helps)
+    assert any("remove `wet` or `hot`" in one for one in errors[0].helps)
     effects = CHANGE.replace(
         "wet -> mud if above is air",
         "wet -> mud if above is air, then age += 1\n      - wet -> mud if below is air, then age += 1",
@@ -127,11 +127,11 @@ def test_a_value_of_an_added_pack() -> None:
     trees = TREES.replace("fields:", "properties: {heat: 0..9}\nfields:")
     passes = CHANGE.replace("hot ->", "heat > 5 ->")
     for added, caret, words in (
-        ("also:\n  pond: {heat: 7}\n", "heat", "gives `pond` the value `heat`"),
+        ("also:\n  pond: {heat: 7}\n", "heat", "adds the value `heat` to `pond`"),
         (
             'elements:\n  lye: {color: "#A0C0FF", heat: 7}\nalso:\n  lye: wet\n',
             "wet",
-            "gives `lye` the tag `wet`",
+            "adds the tag `wet` to `lye`",
         ),
     ):
         _, (warning,) = load(passes, f"pack: kiln\nneeds: trees\n{added}", trees)

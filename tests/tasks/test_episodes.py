@@ -100,7 +100,7 @@ def test_invalid_actions_are_refused(torch, program_of):
         bad = good.copy()
         bad[1, place] = value
         with pytest.raises(
-            ValueError, match=rf"actions\[1, {place}\] \({name}\) is {value}: it must lie in 0\.\."
+            ValueError, match=rf"actions\[1, {place}\] \({name}\) is {value}: it must be in 0\.\."
         ):
             check_actions(program, bad)
     for wrong in (good[0], good[:, :4], good[None]):

@@ -148,13 +148,13 @@ def test_a_run_in_parts_is_a_run_at_once(name: str | None, dunes: str) -> None:
         ("nowhere:Net", "ModuleNotFoundError: No module named 'nowhere'"),
         ("faulty:Net", "faulty.py:1"),
         ("nets:Widee", "did you mean `Wide`?"),
-        ("nets:number", "is not a class but int"),
+        ("nets:number", "expected a class, found int"),
         ("../nets:Wide", "write MODULE:CLASS"),
         ("nets:Other", "TypeError"),
-        ("nets:NoModule", "must give a torch.nn.Module, found NoModule"),
-        ("nets:Flat", "must give logits [2, 10, 14, 18], found [2, 14, 18] of torch.int64"),
-        ("nets:Words", "must give logits [2, 10, 14, 18], found str"),
-        ("nets:Still", "no gradient reaches a parameter"),
+        ("nets:NoModule", "must return a torch.nn.Module, found NoModule"),
+        ("nets:Flat", "must return logits [2, 10, 14, 18], found [2, 14, 18] of torch.int64"),
+        ("nets:Words", "must return logits [2, 10, 14, 18], found str"),
+        ("nets:Still", "no parameter gets a gradient"),
         ("nets:Broken", "RuntimeError: no such layer"),
     ],
 )
@@ -186,7 +186,7 @@ def test_a_run_that_names_a_network_needs_it_on_the_command_line(dunes: str) -> 
         code, output, imported = was_imported("wm", *others, "--backend", "torch")
         assert (code, imported) == (2, False), output
         assert "PD623" in output
-        assert "which it calls `nets:Wide`" in output
+        assert "the custom network `nets:Wide`" in output
         code, output, imported = was_imported("wm", *others, "--backend", "torch", "--network", "nets:made")
         assert code == 2, output
         assert "it was trained with `nets:Wide`, not with `nets:made`" in output

@@ -209,7 +209,7 @@ def test_a_network_is_tested_on_another_recording_of_the_task(copy: Path) -> Non
         (("eval", "run", "--split", "train"), "--split selects worlds"),
         (("eval", "run", "--worlds", "3"), "--worlds selects worlds"),
         (("show", "run", "--out", "a.png", "--steps", "4"), "--steps selects worlds"),
-        (("finetune", "run", "--packs", "lava"), "it learned from a dataset"),
+        (("finetune", "run", "--packs", "lava"), "it was trained on a dataset"),
     ],
 )
 def test_options_that_make_no_sense_are_refused(words: tuple[object, ...], said: str, copy: Path) -> None:

@@ -112,7 +112,7 @@ def test_other_networks_are_trained_and_tested_too(dunes: str, tmp_path: Path) -
         train(config, tmp_path / "other", machine=HERE, network=Own(9))
     errors = refusal(load_trained, run)
     assert errors[0].code == "PD623"
-    assert "weights are those of another network" in errors[0].notes[0]
+    assert "its weights belong to another network" in errors[0].notes[0]
 
 
 @pytest.mark.slow
