@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import zipfile
 from pathlib import Path
 
@@ -41,3 +42,12 @@ def test_wheel_runs_elsewhere(scripts: Path, tmp_path: Path) -> None:
     assert "No module named 'tests'" in missing.stderr
     refused = run(scripts / "powderdsl", "check", "no-such-rules", cwd=tmp_path)
     assert refused.returncode == 2, "the line above proves nothing if `check` never says no"
+
+
+def test_links_of_the_readme_lead_somewhere_on_pypi(wheel: Path) -> None:
+    with zipfile.ZipFile(wheel) as archive:
+        (name,) = (name for name in archive.namelist() if name.endswith(".dist-info/METADATA"))
+        text = archive.read(name).decode()
+    targets = re.findall(r"\]\(([^)\s]+)\)", text)
+    assert len(targets) > 20
+    assert [target for target in targets if not target.startswith("https://")] == []
