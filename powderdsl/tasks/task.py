@@ -43,7 +43,7 @@ class Knob:
     lo: int
     hi: int
     value: int
-    about: str
+    about: str = field(metadata=UNMEANING)
     span: Span = field(compare=False, repr=False)
 
 
@@ -145,7 +145,7 @@ class Split:
     """
 
     name: str
-    about: str
+    about: str = field(metadata=UNMEANING)
     variants: tuple[Generator, ...]
     params: tuple[ParamRange, ...] = ()
     rulesets: tuple[tuple[str, ...], ...] = ()
@@ -267,7 +267,7 @@ class Task:
     """A checked task. `knobs` are filled in; `ruleset` has the task's parameters."""
 
     name: str
-    about: str
+    about: str = field(metadata=UNMEANING)
     ruleset: Ruleset
     size: Size
     knobs: tuple[Knob, ...]

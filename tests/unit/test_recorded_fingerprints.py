@@ -27,9 +27,9 @@ splits:
   test: {knobs: {many: 5}}
 """
 RECORDED = {
-    "task": "96392df252f36572",
+    "task": "a5259c04c00ea59b",
     "goal": "b5ca4d0c7989337c",
-    "splits": "ed992e1d0651b1c6",
+    "splits": "dad27f9dfce5a554",
     "agent": "e387b8aca9904ca3",
 }
 
@@ -40,3 +40,13 @@ def test_a_task_keeps_its_fingerprint() -> None:
     found["splits"] = fingerprint(task.split("train")) + fingerprint(task.split("test"))
     found["task"] = fingerprint(task)
     assert {name: value[:16] for name, value in found.items()} == RECORDED
+
+
+def test_descriptions_do_not_change_a_task() -> None:
+    reworded = TASK.replace("how many}", "the number of lines}").replace(
+        "task: yard\n", "task: yard\nabout: Move sand.\n"
+    )
+    reworded = reworded.replace("test: {knobs", "test: {about: More lines., knobs")
+    tasks = [read_task(Source("yard.yaml", text), Reporter()) for text in (TASK, reworded)]
+    assert tasks[0] is not None
+    assert fingerprint(tasks[0]) == fingerprint(tasks[1])
