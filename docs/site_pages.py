@@ -35,6 +35,7 @@ ROOT = Path(__file__).resolve().parents[1]
 CACHE = ROOT / ".site"
 BOOSTS = {
     "guides/recipes.md": 2,
+    "editors.md": 2,
     "tutorials/": 1.5,
     "language/": 1.5,
     "diagnostics.md": 0.3,
