@@ -400,9 +400,10 @@ def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Fil
     page.meta["search"] = {"exclude": page_path.startswith("decisions/0"), "boost": max(boosts, default=1)}
     folder = PurePosixPath("docs", page_path).parent if page_path not in COPIED else PurePosixPath(".")
 
+    copied = {name: page for page, name in COPIED.items()}
+
     def link(match: re.Match[str]) -> str:
         target = os.path.normpath(folder / match[2]).replace(os.sep, "/")
-        copied = {name: page for page, name in COPIED.items()}
         inside = copied.get(target) or (target.removeprefix("docs/") if target.startswith("docs/") else "")
         file = files.get_file_from_path(inside) if inside else None
         if file and file.inclusion.is_included():

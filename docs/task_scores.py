@@ -1,4 +1,4 @@
-"""Returns that the playground shows beside one's own: `python docs/task_scores.py` writes `web/page/scores.json`.
+"""Returns that the playground compares with the player's: `python docs/task_scores.py` writes `web/page/scores.json`.
 
 Of each task that can be played there, in each of its worlds: what its expert (if there is one), random actions and doing
 nothing return. Random is a mean over PLAYS episodes.

@@ -41,7 +41,10 @@ def check(distribution: Path, python: str, torch: str) -> None:
         pip = (scripts / "python", "-m", "pip", "install", "--quiet", "--disable-pip-version-check")
         # Each in a call: pip would otherwise weigh newer versions of torch, of gigabytes.
         succeed(*pip, f"torch=={torch}", cwd=Path(folder))
-        succeed(*pip, f"powderdsl[rl] @ {distribution.resolve().as_uri()}", cwd=Path(folder))
+        # pip would keep the wheel that it builds from an sdist, and use it for the next file of that name.
+        succeed(
+            *pip, "--no-cache-dir", f"powderdsl[rl] @ {distribution.resolve().as_uri()}", cwd=Path(folder)
+        )
         for command, *words in COMMANDS:
             succeed(scripts / command, *words, cwd=Path(folder))
 
