@@ -172,23 +172,16 @@ def scene_statements() -> str:
 
 
 def tasks(families: bool = False) -> str:
-    """The tasks that come with powderdsl, in families or not: the goal, the choices and the number of actions."""
+    """The tasks that come with powderdsl, in families or not, and their goals."""
     from powderdsl.tasks.shipped import load_task, shipped_tasks
-    from powderdsl.tasks.task import BLOW, NO_CHANGE
 
     loaded = sorted(((name, load_task(name)) for name in shipped_tasks()), key=lambda named: named[1].family)
-    rows = []
-    for name, task in loaded:
-        if bool(task.family) != families:
-            continue
-        names = {element.id: element.name for element in task.ruleset.elements}
-        every = set(names) <= set(task.agent.choices)
-        words = ["any"] if every else [names[choice] for choice in task.agent.choices if choice >= 0]
-        words += ["blow"] if BLOW in task.agent.choices else []
-        words += ["nothing"] if NO_CHANGE in task.agent.choices else []
-        family = (task.family,) if families else ()
-        rows.append((f"`{name}`", task.about, ", ".join(words), str(task.agent.actions), *family))
-    return table(("task", "goal", "choices", "actions", *(["family"] if families else [])), rows)
+    rows = [
+        (f"`{name}`", task.about, *((task.family,) if families else ()))
+        for name, task in loaded
+        if bool(task.family) == families
+    ]
+    return table(("task", "goal", *(["family"] if families else [])), rows)
 
 
 def stages() -> str:
@@ -250,28 +243,23 @@ def mutation_operators() -> str:
 
 
 def mutation_testing() -> str:
-    """What `docs/mutation_table.py` has counted, a line a pack, and the sum."""
+    """What `docs/mutation_table.py` has counted: the packs with survivors, all others together, and the sum."""
     from powderdsl.testing.mutation.judging import COUNTED, noticed_share
 
     path = DOCS / "mutation.json"
     measured = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
-    rows = []
-    total = dict.fromkeys(COUNTED, 0)
-    for entry in measured.values():
-        for pack, counts in entry["packs"].items():
-            rows.append((f"`{pack}`", counts))
-            total = {key: total[key] + counts[key] for key in COUNTED}
-    shown = [key for key in COUNTED if key != "killed"]
+    packs = {name: counts for entry in measured.values() for name, counts in entry["packs"].items()}
+    complete = {name for name, counts in packs.items() if not counts["survived"]}
+
+    def sum_of(names: Iterable[str]) -> dict[str, int]:
+        return {key: sum(packs[name][key] for name in names) for key in COUNTED}
+
+    rows = [(f"`{name}`", counts) for name, counts in packs.items() if name not in complete]
+    rows += [(f"{len(complete)} others", sum_of(complete)), ("**all**", sum_of(packs))]
+    shown = [key for key in COUNTED if key not in ("killed", "generated")]
     return table(
         ("pack", *shown, "noticed"),
-        (
-            (
-                name,
-                *(str(counts[key]) for key in shown),
-                f"{100 * noticed_share(counts):.1f} %",
-            )
-            for name, counts in [*rows, ("**all**", total)]
-        ),
+        ((name, *(str(n[key]) for key in shown), f"{100 * noticed_share(n):.1f} %") for name, n in rows),
     )
 
 
