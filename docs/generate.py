@@ -154,15 +154,11 @@ def shipped(rulesets: bool = False) -> str:
     for name in shipped_rules():
         packs, ruleset = read([name], Reporter())
         if ruleset and rulesets:
-            rows.append((f"`{name}`", ", ".join(ruleset.members), ruleset.about))
+            rows.append((f"`{name}`", ruleset.about))
         elif not ruleset and not rulesets:
             pack = packs[-1]  # its needs come first
-            words = (
-                ", ".join(scalar.text for scalar in pack.needs),
-                ", ".join(e.name.text for e in pack.elements),
-            )
-            rows.append((f"`{name}`", *words, pack.about))
-    head = ("ruleset", "packs") if rulesets else ("pack", "needs", "elements")
+            rows.append((f"`{name}`", ", ".join(e.name.text for e in pack.elements), pack.about))
+    head = ("ruleset",) if rulesets else ("pack", "elements")
     return table((*head, "description"), rows)
 
 
@@ -208,40 +204,6 @@ def commands() -> str:
     return table(("", "command", "what it does"), rows)
 
 
-MISTAKES: dict[str, str] = {
-    "neighbor": "another neighbor: `below` for `above`, `left` for `below.left`",
-    "comparison": "`<=` for `<`, `!=` for `==`, `is not` for `is`",
-    "constant": "a number changed by one, or doubled",
-    "chance": "a chance multiplied by 10, 1/10 or 3/2",
-    "connective": "`or` for `and`, or a missing part of a condition",
-    "negation": "an added or missing `not`",
-    "guard": "a missing `if`, `where` or `with chance`",
-    "effect": "a missing effect after `then`",
-    "write": "`+=` for `:=`, `-=` for `+=`",
-    "arithmetic": "`-` for `+`, `max` for `min`, the other branch of a choice",
-    "coordinate": "`column` for `row`",
-    "element": "another element, or source and target exchanged",
-    "set": "another set, a missing member, a missing `any but`",
-    "tag": "a missing, different or added tag",
-    "kernel": "another kernel, weight or edge mode",
-    "stream": "another stream",
-    "let": "another `let` value, or its expression instead of its name",
-    "parameter": "another parameter",
-    "property": "another property, or another value of an element",
-    "field": "another field; `at`, `resets`, `of`, default or range changed",
-    "side": "a missing direction or symmetry",
-    "order": "passes, rounds or rules in another order",
-    "conflicts": "another policy for conflicts, or none",
-    "rule": "a missing rule or block",
-    "override": "an added or missing override",
-}
-"""Kinds of mistakes, and a line about each."""
-
-
-def mutation_operators() -> str:
-    return table(("mistake", "replacement"), ((f"`{n}`", about) for n, about in MISTAKES.items()))
-
-
 def mutation_testing() -> str:
     """What `docs/mutation_table.py` has counted: the packs with survivors, all others together, and the sum."""
     from powderdsl.testing.mutation.judging import COUNTED, noticed_share
@@ -264,7 +226,6 @@ def mutation_testing() -> str:
 
 
 TABLES: dict[str, Callable[[], str]] = {
-    "mutation operators": mutation_operators,
     "mutation testing": mutation_testing,
     "functions": functions,
     "kinds": kinds,
