@@ -527,7 +527,7 @@ def lower(ruleset: Ruleset, memo: Memo | None = None) -> Program:
 def segments_of(ruleset: Ruleset, memo: Memo | None = None) -> tuple[Segment, ...]:
     """A ruleset as segments of optimized IR, on bit planes if the planes can represent the passes. `memo` as in `lower`."""
     return persistent(
-        f"{ruleset.name} on planes", ruleset.text_key, lambda: parts(lower(ruleset, memo), memo)
+        f"{ruleset.name} on planes", lambda: ruleset.text_key, lambda: parts(lower(ruleset, memo), memo)
     )
 
 

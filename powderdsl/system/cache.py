@@ -67,19 +67,20 @@ def code_hash() -> str:
     return digest.hexdigest()
 
 
-def persistent(name: str, inputs: str, make: Callable[[], T]) -> T:
+def persistent(name: str, inputs: str | Callable[[], str], make: Callable[[], T]) -> T:
     """The result of `make`, from the cache if an earlier process made it with the same code.
 
     Exceptions and quick results are not stored. A cache that cannot be read or written only costs time.
 
     Args:
         name: what the result is; each stage has names of its own.
-        inputs: a text that determines the result of the stage.
+        inputs: a text that determines the result of the stage, or a function that returns it, if that takes long.
         make: returns the result, which can be pickled.
     """
     if not STORED:
         return make()
-    text = f"{code_hash()}\0{sys.version}\0{name}\0{inputs}"
+    known = inputs if isinstance(inputs, str) else inputs()
+    text = f"{code_hash()}\0{sys.version}\0{name}\0{known}"
     key = hashlib.sha256(text.encode("utf-8", "surrogatepass")).hexdigest()[:32]
     with suppress(OSError):
         path = find(compiled_folder(), key)

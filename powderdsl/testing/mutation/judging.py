@@ -42,6 +42,7 @@ from powderdsl.simulation.simulator import Simulator, World, compile
 from powderdsl.syntax.yaml_tree import Mapping as YamlMapping
 from powderdsl.syntax.yaml_tree import Sequence as YamlSequence
 from powderdsl.syntax.yaml_tree import parse_yaml
+from powderdsl.system import cache
 from powderdsl.system.cache import Memo
 from powderdsl.system.interrupts import delay_signal
 from powderdsl.system.writing import write_text
@@ -181,7 +182,7 @@ def judge(original: Original, mutant: Mutant, seed: int = 0) -> Verdict:
             mutated = part.mutated(mutant)
             if not mutated or mutated[1] - part.warnings or meaning_of(mutated[0], part.memo) == part.meaning:
                 break
-            if failed := failed_test(part, part.sim.of(mutated[0]), mutant.pack, quick=True):
+            if failed := failed_test(part, part.sim.of(mutated[0]), mutant.pack, 0, 1):
                 return failed
     try:
         mutated = original.mutated(mutant)
@@ -196,15 +197,20 @@ def judge(original: Original, mutant: Mutant, seed: int = 0) -> Verdict:
     if meaning == original.meaning:
         return Verdict("equivalent", "the same program")
     sim, focus = original.sim.of(ruleset), focused(original, mutant)
-    if failed := failed_test(original, sim, mutant.pack, quick=True):
+    if failed := failed_test(original, sim, mutant.pack, 0):
         return failed
     comparison = compare(original.sim, sim, PROOF, focus, seed)
-    distinction = comparison.distinction  # without one, what runs many worlds notices nothing either
+    distinction = comparison.distinction
+    if meaning[1] == original.meaning[1] and comparison.status == "equal":
+        return Verdict("equivalent", "a proof")
+    if failed := failed_test(original, sim, mutant.pack, 1):
+        return failed
+    # What runs many worlds notices nothing where the comparison, which runs more, has found none.
     if (distinction or meaning[1] != original.meaning[1]) and (broken := broken_invariant(original, sim)):
         return Verdict("killed", "invariant", broken.text)
     if distinction is None:
         return Verdict("equivalent", "a proof") if comparison.status == "equal" else Verdict("survived")
-    if failed := failed_test(original, sim, mutant.pack, quick=False):
+    if failed := failed_test(original, sim, mutant.pack, 2):
         return failed
     shown = not distinction.draws  # a test needs a seed
     test = written_test(mutant, distinction, original.sim, original.packs) if shown else None
@@ -214,23 +220,24 @@ def judge(original: Original, mutant: Mutant, seed: int = 0) -> Verdict:
 # Tests
 
 
-def failed_test(original: Original, sim: Simulator, pack: str, *, quick: bool) -> Verdict | None:
-    """The verdict by a test that the original passes and the mutant fails: one written by hand, if there is one.
+def failed_test(original: Original, sim: Simulator, pack: str, *phases: int) -> Verdict | None:
+    """The verdict by a test of some phases that the original passes and the mutant fails: by hand, if there is one.
 
-    `quick`: only tests that cost less than invariants; otherwise only the others. Counted ones, each of which runs many
-    worlds, run after exact ones and cost more, unless they are of the mutated pack and most likely to fail.
+    Phase 0 has the mutated pack's tests, which fail most often; phase 1 those of other packs, and phase 2 those that
+    the tool has written and those of other packs that count, each of which runs many worlds.
     """
 
-    def cost(example: Example) -> tuple[bool, bool, bool, bool, int]:
+    def cost(example: Example) -> tuple[int, bool, bool, int]:
         counted, other = bool(example.often), example.pack != pack
-        return example.name.startswith(GENERATED), counted and other, counted, other, example.steps
+        late = example.name.startswith(GENERATED) or (counted and other)
+        return 2 if late else int(other), example.name.startswith(GENERATED), counted, example.steps
 
     for example in sorted(sim.ruleset.tests, key=cost):
-        if (not any(cost(example)[:2])) == quick:
+        if cost(example)[0] in phases:
             alone = replace(example, scope=())  # which added packs make a test fail does not matter here
             (result,) = run_examples(replace(sim.ruleset, tests=(alone,)), sim=sim)
             if not result.passed and original.holds(example.name):
-                by = "generated" if cost(example)[0] else "test"
+                by = "generated" if example.name.startswith(GENERATED) else "test"
                 return Verdict("killed", by, f"{example.pack}: {example.name}")
     return None
 
@@ -339,7 +346,7 @@ def _begin_process() -> None:
         os._exit(1)
 
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    os.environ["XDG_CACHE_HOME"] = os.devnull  # nobody compiles a mutant again
+    cache.STORED = False  # nobody compiles a mutant again
     Thread(target=end_with_parent, daemon=True).start()
 
 
