@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from functools import cache
-from pathlib import Path
 
 import pytest
 
@@ -99,8 +98,6 @@ def test_a_mistake_of_each_kind(operator, line):
 def test_mutants_differ_and_each_says_where():
     found = mutants()
     assert len({one.text for one in found}) == len(found) > 100
-    page = Path("docs/testing.md").read_text(encoding="utf-8")
-    assert not [one for one in found if f"\n| `{one.operator}` | " not in page]
     for one in found:
         file, line, column = one.place.split(":")
         assert file == "moss.yaml"
