@@ -1,1 +1,1 @@
-"""Static analysis: facts about rules that need no run."""
+"""Static analysis: facts about rules, found without running them."""

@@ -36,7 +36,7 @@ from powderdsl.model.types import (
 )
 
 MAX_QUESTION = 20_000
-"""Nodes evaluated for one question, after which the answer is that it may be."""
+"""Maximum number of nodes evaluated for one question; beyond it, the effect counts as possible."""
 
 T = TypeVar("T")
 
@@ -61,7 +61,7 @@ class RuleLine:
 
 @dataclass
 class LineEffects:
-    """Effects of the rules of one line, by ids. `pairs` are (before, after), never of one element."""
+    """Effects of the rules of one line, by ids. `pairs` are (before, after) with different elements."""
 
     line: RuleLine
     fires: bool = False
@@ -79,7 +79,7 @@ class SubstepSearch:
     lets: dict[str, Expr]
 
     def may(self, rule: Rule, *more: Condition) -> bool:
-        """True if the rule may happen while further conditions hold. False is a proof."""
+        """True if the rule may fire while further conditions hold. False is a proof that it cannot."""
         first = ((rule.mask, HERE), *more)
         if not satisfiable(self.facts, first, self.lets):
             return False
@@ -87,7 +87,7 @@ class SubstepSearch:
         return not rivals or satisfiable(self.facts, (*first, *rivals), self.lets)
 
     def elements(self, rule: Rule, at: Offset, apart: Offset | None = None, known: Ids = frozenset()) -> Ids:
-        """The ids that may be at a place where the rule happens, but not at the place `apart`; `known` ids are skipped."""
+        """The ids that may be at a place where the rule fires, but not at the place `apart`; skip `known` ids."""
         ids = set()
         for number in self.facts.ids:
             more = [] if apart is None else [element_is_not(number, apart)]
@@ -107,7 +107,7 @@ class SubstepSearch:
         conditions: list[Condition] = []
         cells = footprint(rule)
         if isinstance(rule, Swap) or (isinstance(rule, Move) and rule.leaving is not None):
-            # pairs of one rule that share a cell: none of them happens
+            # pairs of one rule that share a cell: neither fires
             dy, dx = rule.offset
             conditions += [(negation(rule.mask), rule.offset), (negation(rule.mask), (-dy, -dx))]
         for other in self.moment.rules:
@@ -160,7 +160,7 @@ def find_changes(ruleset: Ruleset, facts: Facts, *, together: bool = True) -> li
 
 
 def may_rise_and_fall(ruleset: Ruleset, facts: Facts, number: int) -> tuple[bool, bool]:
-    """Whether some rule may turn other elements into an element, and this one into others: less work than `find_changes`."""
+    """True if some rule may turn other elements into an element and this one into others. Faster than `find_changes`."""
     rises = falls = False
     for _, moment in substeps(ruleset.passes):
         search = SubstepSearch(moment, facts, moment.values)
@@ -190,7 +190,7 @@ def line_effects(ruleset: Ruleset) -> list[LineEffects]:
 
 
 def reactions(ruleset: Ruleset) -> Iterator[tuple[RuleLine, list[int], list[int]]]:
-    """The lines that turn elements into others by themselves, with the ids before and after, ascending."""
+    """The lines that transform elements without help from other lines, with the ids before and after, ascending."""
     for effects in line_effects(ruleset):
         if effects.pairs:
             before, after = zip(*effects.pairs, strict=True)
@@ -203,7 +203,7 @@ def moved_ids(ruleset: Ruleset) -> frozenset[int]:
 
 
 def unchanging_ids(ruleset: Ruleset) -> frozenset[int]:
-    """The elements that no rule moves or turns into anything: they stay in place permanently."""
+    """The elements that no rule moves or transforms: they stay in place permanently."""
     ids = {element.id for element in ruleset.elements}
     for effects in line_effects(ruleset):
         ids -= effects.moves | {before for before, _ in effects.pairs}
@@ -215,7 +215,7 @@ def rule_line(rule: Rule, pass_: Pass) -> RuleLine:
 
 
 def _add_effects(rule: Rule, search: SubstepSearch, effects: LineEffects) -> None:
-    """Add the elements to `effects` that a rule, which may happen, moves or turns into others."""
+    """Add the elements to `effects` that a rule, which may fire, moves or transforms."""
     if isinstance(rule, Transform):
         effects.pairs |= set(_becomes(rule, search, effects.pairs))
     elif isinstance(rule, (Swap, Move)):
@@ -226,7 +226,7 @@ def _add_effects(rule: Rule, search: SubstepSearch, effects: LineEffects) -> Non
         else:
             effects.moves |= search.elements(rule, HERE, known=effects.moves | {left.value})
         if isinstance(rule, Move):
-            # what it moves to is lost; of a row that leaves nothing behind, one is lost, and one is there twice
+            # the target's content is lost; in a row that leaves nothing behind, one element is lost and one doubled
             lost = search.elements(rule, rule.offset)
             effects.pairs |= _pairs(lost, lost if left is None else {left.value})
 
@@ -236,7 +236,7 @@ def _pairs(before: Ids, after: Ids) -> Pairs:
 
 
 def _becomes(rule: Transform, search: SubstepSearch, known: Pairs = frozenset()) -> Iterator[tuple[int, int]]:
-    """The pairs (before, after) of a transform that are not known yet."""
+    """The pairs (before, after) of a transform that have not been found yet."""
     firsts, lasts = search.elements(rule, HERE), {rule.target.value}
     if rule.target.op != "const":
         candidates = search.facts.ids
@@ -275,17 +275,17 @@ def _joint_effects(search: SubstepSearch) -> tuple[list[Rule], Pairs]:
     return live, _pairs(lost, gained)
 
 
-# Worlds that lack an element. An element is absent if no cell holds it and no field names it.
+# Worlds that lack an element: no cell contains it and no field names it.
 
 MAX_NEEDS = 6
-"""The most needs that are kept for a line: the smallest ones."""
+"""Maximum number of needs stored for a line: the smallest ones."""
 
 
 @dataclass(frozen=True)
 class Requirements:
-    """The elements that a line depends on. Of each of `needs` one element must exist, or the line cannot happen.
+    """The elements that a line depends on. An element of each of `needs` must exist, or the line cannot fire.
 
-    `copies`: ids that it only brings about where these already exist.
+    `copies`: ids that it creates only where they already exist.
     """
 
     needs: tuple[frozenset[int], ...]
@@ -342,7 +342,7 @@ def _by_size(ids: frozenset[int]) -> tuple[int, list[int]]:
 
 
 def named_by_fields(ruleset: Ruleset) -> frozenset[int]:
-    """The ids that a field or a value under `let` may name although no cell ever held them."""
+    """The ids that a field or a value under `let` may name although no cell ever contained them."""
     fields = [*ruleset.fields, *(item for pass_ in ruleset.passes for item in pass_.scratch)]
     ids = {int(value) for item in fields if item.kind == ELEMENT for value in item.defaults}
     for _, moment in substeps(ruleset.passes):
@@ -367,7 +367,7 @@ def _nodes_of(rule: Rule, lets: Lets) -> Iterator[Expr]:
 class ReducedWorld:
     """A substep in a world that has lacked some elements since the step began.
 
-    Rival rules are ignored, which makes more possible.
+    Competing rules are ignored, which makes more effects possible.
     """
 
     def __init__(self, search: SubstepSearch, absent: frozenset[int], lets: Lets):
@@ -379,7 +379,7 @@ class ReducedWorld:
             if name in search.lets:
                 self.search.lets[name] = reduced
             elif value.kind == FLAG and not self._is_possible(reduced):
-                self.search.lets[name] = FALSE  # it was false when an earlier substep fixed it
+                self.search.lets[name] = FALSE  # it was false when an earlier substep computed it
 
     def _is_possible(self, *conditions: Expr) -> bool:
         """True if a cell of this world may fulfill all conditions."""
@@ -390,7 +390,7 @@ class ReducedWorld:
         return self._is_possible(self.rewrite(rule.mask))
 
     def may_make(self, rule: Rule) -> bool:
-        """True if the rule may bring about an element that the world lacks."""
+        """True if the rule may create an element that the world lacks."""
         if isinstance(rule, Transform):
             target = member(self.rewrite(rule.target), tuple(self.absent))
             return self._is_possible(self.rewrite(rule.mask), target)
@@ -408,26 +408,26 @@ class ReducedWorld:
 # Overlaps: two rules meet in one cell, so that their order or the conflict policy decides the result
 
 OUTCOMES = {
-    "first wins": "both claim a cell at once: the first one happens",
-    "both dropped": "both claim a cell at once: neither happens",
+    "first wins": "both claim a cell at once: the first one applies",
+    "both dropped": "both claim a cell at once: neither applies",
     "overwritten": "both claim a cell at once: the later one overwrites the other",
-    "last writes": "both write a field of a cell at once: the last one has the final word",
+    "last writes": "both write a field of a cell at once: the last one wins",
     "cut off": "both change a number of a cell at once: at the bounds of its range the order matters",
-    "first in turn": "both may want to turn a cell into something: the one that runs first does",
+    "first in turn": "both may transform a cell: the one that runs first does",
 }
 """Outcomes for two rules that meet, in words."""
 
 _BY_POLICY = {"first_wins": "first wins", "drop_both": "both dropped", "overwrite": "overwritten"}
 
 MAX_LINES = 64
-"""Lines that transform cells, up to which every two of different substeps are compared."""
+"""Maximum number of lines that transform cells for which all pairs in different substeps are compared."""
 
 
 @dataclass(frozen=True)
 class Overlap:
-    """Two lines that may meet in one cell. `outcome` is one of OUTCOMES; `field` is what they both write, if any.
+    """Two lines that may meet in one cell. `outcome` is one of OUTCOMES; `field` is the field that both write, if any.
 
-    The lines may be one line, of which a loop or a symmetry makes several rules.
+    Both may be the same line, from which a loop or a symmetry makes several rules.
     """
 
     outcome: str
@@ -437,7 +437,7 @@ class Overlap:
 
 
 Candidate = tuple[Overlap, Iterable[Conditions], Lets]
-"""Two lines, the conditions of each way in which they could meet, and the values under `let`."""
+"""Two lines, the conditions for each way in which they could meet, and the values under `let`."""
 
 
 def find_overlaps(ruleset: Ruleset, facts: Facts) -> tuple[Overlap, ...]:
@@ -460,7 +460,7 @@ def _candidates(ruleset: Ruleset, facts: Facts) -> Iterator[Candidate]:
 
 
 def _claims(search: SubstepSearch, pass_: Pass) -> Iterator[Candidate]:
-    """Rules of one substep that may claim one cell, where a policy decides."""
+    """Rules of one substep that may claim the same cell, where a policy decides."""
     # Rules that are always dropped meet others too: only the conditions count here.
     movers = [rule for rule in search.moment.rules if not isinstance(rule, Assign)]
     for i, second in enumerate(movers):
@@ -484,7 +484,7 @@ def _ordered_pairs(items: Sequence[T]) -> Iterator[tuple[T, T]]:
 
 
 def _writes(rules: list[Rule], search: SubstepSearch, pass_: Pass) -> Iterator[Candidate]:
-    """Writes of one field in one substep whose order makes a difference. Roundings of floats are left out."""
+    """Writes of one field in one substep whose order affects the result. Rounding of floats is ignored."""
     keeps_apart = search.moment.policy in ("drop_both", "first_wins")
     for kind in (True, False):
         chosen = [rule for rule in rules if isinstance(rule, Assign) == kind]
@@ -495,13 +495,13 @@ def _writes(rules: list[Rule], search: SubstepSearch, pass_: Pass) -> Iterator[C
                 continue
             own = not kind and a.offset in footprint(first) and b.offset in footprint(second)
             if keeps_apart and own and first is not second:
-                continue  # rules that happen never share a cell
+                continue  # rules that fire never share a cell
             overlap = Overlap(outcome, rule_line(first, pass_), rule_line(second, pass_), a.field)
             yield overlap, [((first.mask, HERE), (second.mask, minus(a.offset, b.offset)))], search.lets
 
 
 def order_matters(a: Assign, b: Assign) -> str:
-    """The key of OUTCOMES if these two write one cell, or an empty text."""
+    """The key of OUTCOMES if these two write the same cell, or an empty text."""
     if a.field != b.field or (a.op == b.op == ":=" and a.value == b.value):
         return ""
     if ":=" in (a.op, b.op):
@@ -530,7 +530,7 @@ def _in_turn(ruleset: Ruleset) -> Iterator[Candidate]:
 
 
 def _number_lets(expr: Expr, number: int) -> Expr:
-    """The expression with the substep's number in names under `let`, which different substeps may share."""
+    """The expression with the substep's number added to names under `let`, which different substeps may share."""
     if expr.op == "let":
         return replace(expr, value=f"{expr.value}@{number}")
     args = tuple(_number_lets(arg, number) for arg in expr.args)

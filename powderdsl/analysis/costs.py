@@ -9,9 +9,9 @@ from powderdsl.ir.bits import PassForm, choose_form
 from powderdsl.ir.ops import OPS, REAL, Offset, PassGraph, Program, nodes_of
 
 WEIGHTS = {"gates": 1.0, "shifts": 4.0, "moves": 8.0, "random_bits": 8.0, "reals": 32.0, "dense": 200.0}
-"""The cost of one of each, in vector operations on 512 cells: sixteen floats fill the vector that holds 512 flags, a
-random bit is a hash, passes on cells go through memory. The shares of the shipped rulesets agree with measurements of
-native code on worlds full of everything, mostly within a factor of two."""
+"""The cost of one operation of each kind, in vector operations on 512 cells. A vector holds 512 flags or sixteen floats;
+a random bit is a hash; passes on cells go through memory. The shares of the shipped rulesets agree with measurements of
+native code on worlds with all elements, mostly within a factor of two."""
 
 
 @dataclass(frozen=True)
@@ -27,7 +27,7 @@ class PassCost:
     name: str
     pack: str
     moments: int
-    """Substeps, by the name that the output of `check --json` has for them."""
+    """Substeps, by their name in the output of `check --json`."""
     gates: int
     shifts: int
     moves: int
@@ -66,7 +66,7 @@ def costs(program: Program) -> tuple[PassCost, ...]:
 def _work(form: PassForm) -> Counter[str]:
     count: Counter[str] = Counter()
     bits: Counter[str] = Counter()
-    """Random bits a cell: for each stream those that its finest comparison needs. A pass shares them."""
+    """Random bits per cell: for each stream, the bits that its finest comparison needs. A pass shares them."""
     for node in nodes_of(form.planes or form.cells, substeps=False):
         if node.op in ("chance", "below", "below_planes", "draw"):
             stream, most, *limit = node.attr

@@ -1,8 +1,8 @@
-"""The ledger of a ruleset: what its rules create, destroy and move, and what follows for all worlds; as text, as JSON.
+"""The ledger of a ruleset: the elements that its rules create, destroy and move, and the consequences for all worlds.
 
-A verdict `Proven` holds for worlds of every size and every content, for all parameter values and all random numbers
-that streams draw, at every step. `NotProven` names the lines of rules that stand in the way: it is not a proof of the
-contrary, for several rules may make up for each other.
+A verdict `Proven` holds for worlds of every size and content, for all parameter values and random numbers, at every
+step. `NotProven` names the lines of rules that prevent a proof. The statement may still be true, since several rules
+may compensate for each other.
 """
 
 from __future__ import annotations
@@ -36,10 +36,10 @@ from powderdsl.model.types import Assign, Field, Property, Ruleset
 Bounds = tuple[float, float]
 
 BUDGET = 2_000_000
-"""Nodes evaluated for each part of a ledger: some seconds. The largest shipped ruleset needs most of it."""
+"""Maximum number of nodes evaluated for each part of a ledger: some seconds. The largest shipped ruleset needs most."""
 
 QUICK = 20_000
-"""Nodes evaluated for the trend of one element: at most about 50 ms."""
+"""Maximum number of nodes evaluated for the trend of one element: at most about 50 ms."""
 
 TREND_BREAKS: dict[str, Callable[..., Any]] = {"constant": ne, "never rises": gt, "never falls": lt}
 """The trends of a number, each with the comparison of a later value and an earlier one that breaks it."""
@@ -49,7 +49,7 @@ TREND_BREAKS: dict[str, Callable[..., Any]] = {"constant": ne, "never rises": gt
 class Proven:
     """A statement that holds in every world, at every step. `given` is a condition on the start world, if any.
 
-    `by` is how it was proven: from the ``ledger``, or by a ``search`` through everything that a cell can be.
+    `by` is the method of the proof: the ``ledger``, or a ``search`` through all possible contents of a cell.
     """
 
     reason: str
@@ -62,7 +62,7 @@ class Proven:
 
 @dataclass(frozen=True)
 class NotProven:
-    """A statement that is not decided: some lines of rules may break it."""
+    """An undecided statement: some lines of rules may break it."""
 
     reason: str
     rules: tuple[RuleLine, ...] = ()
@@ -76,14 +76,14 @@ Verdict = Proven | NotProven
 
 @dataclass(frozen=True)
 class RuleEntry:
-    """Upper bounds of what one line does.
+    """Upper bounds of the effects of one line.
 
-    `changes` are pairs (before, after) of elements: in a cell where the first was, the second is. `moves` are the
-    elements that it carries away or pushes aside. `fires` is False if it is proven that it never happens.
+    `changes` are pairs (before, after) of elements: the second replaces the first in a cell. `moves` are the elements
+    that it carries away or pushes aside. `fires` is False if the line is proven to have no effect.
 
-    Of each of `needs` one element must exist, or the line cannot happen. `copies` are elements that it makes only where
-    they exist already. To exist is to be held by a cell, or named by a field, at the start of
-    the step or earlier in it.
+    At least one element of each of `needs` must exist, or the line cannot fire. `copies` are elements that it creates
+    only where they already exist. An element exists if a cell contains it or a field names it, now or earlier in
+    the step.
     """
 
     rule: RuleLine
@@ -98,9 +98,9 @@ class RuleEntry:
 class FieldEntry:
     """A field, a scratch field of a pass, or a property that cells may override.
 
-    `bounds` are the declared ones, for numbers: every write is cut off at them. `fresh_bounds` are kept by a world in
-    which they hold once, such as one whose field was never set by hand. `travels`: with the element, else it stays
-    with the place.
+    `bounds` are the declared ones, for numbers: every write is clamped to them. `fresh_bounds` hold permanently in a
+    world in which they hold once, such as one whose field was never set by hand. `travels`: it moves with the
+    element; otherwise it stays in its place.
     """
 
     name: str
@@ -111,7 +111,7 @@ class FieldEntry:
     fresh_bounds: Bounds | None
     writers: tuple[RuleLine, ...]
     reaches: tuple[tuple[RuleLine, Bounds], ...]
-    """For each line that writes an integer: how low it can bring it, ∞ if it never lowers it, and how high, or -∞."""
+    """For each line that writes an integer: the lowest result, or ∞ if it never lowers it, and the highest, or -∞."""
 
 
 @dataclass(frozen=True)
@@ -119,7 +119,7 @@ class Ledger:
     """The effects of a ruleset's rules, line by line, and conclusions from them. Elements are given by name.
 
     `complete` is False if the search ran out of budget: more effects are then considered possible.
-    `named` are the elements that fields may name although no cell ever held them.
+    `named` are the elements that fields may name although no cell ever contained them.
     """
 
     name: str
@@ -141,7 +141,7 @@ class Ledger:
 
     @cached_property
     def constant_sums(self) -> tuple[tuple[str, ...], ...]:
-        """The smallest sums of elements that no single change alters; every other such sum is made of them.
+        """The smallest sums of elements that no single change alters; all other such sums consist of them.
 
         A change turns one cell of `a` into one of `b`: weights w keep the total if w(a) = w(b). So they are equal
         within each connected part of the graph of changes, and the parts are the sums.
@@ -158,14 +158,14 @@ class Ledger:
     def rising_sums(self) -> tuple[tuple[str, ...], ...]:
         """The smallest sum with each element that never falls, unless that sum is constant.
 
-        Such a sum holds all that its element may become. Every other sum of different elements that cannot fall is
-        joined of these and of constant ones.
+        Such a sum contains everything that its element may become. Every other sum of different elements that cannot
+        fall consists of these and of constant ones.
         """
         return self._closed_sums(self.changes)
 
     @cached_property
     def falling_sums(self) -> tuple[tuple[str, ...], ...]:
-        """The smallest sum with each element that never rises, unless constant: all that may become the element."""
+        """The smallest sum with each element that never rises, unless constant: everything that may become the element."""
         return self._closed_sums([(after, before) for before, after in self.changes])
 
     @property
@@ -177,11 +177,11 @@ class Ledger:
         }
 
     def _closed_sums(self, pairs: Iterable[tuple[str, str]]) -> tuple[tuple[str, ...], ...]:
-        """Each element with everything that it reaches along some pairs, without the constant sums."""
+        """Each element with everything reachable from it along some pairs, without the constant sums."""
         reached = {name: {name} for name in self.elements}
         for before, after in pairs:
             reached[before].add(after)
-        # The transitive closure by Warshall's algorithm: the element on the way is the outer loop.
+        # The transitive closure by Warshall's algorithm: the intermediate element is the outer loop.
         for middle, start in product(self.elements, repeat=2):
             if middle in reached[start]:
                 reached[start] |= reached[middle]
@@ -237,10 +237,12 @@ class Ledger:
             and (element,) not in entry.needs
         ]
         if makers:
-            return NotProven(f"`{element}` may come of other elements", tuple(makers))
+            return NotProven(f"`{element}` may come from other elements", tuple(makers))
         is_made = any(after == element for _, after in self.changes)
         return Proven(
-            f"rules make `{element}` only where it is already" if is_made else f"no rule makes `{element}`"
+            f"rules make `{element}` only where it already exists"
+            if is_made
+            else f"no rule makes `{element}`"
         )
 
     def reach(self, start: Iterable[str]) -> tuple[str, ...]:
@@ -277,7 +279,7 @@ class Ledger:
         if entry.bounds is None:
             return NotProven(f"`{field}` is not a number: it holds {entry.kind}")
         if low <= entry.bounds[0] and entry.bounds[1] <= high:
-            return Proven(f"`{field}` is declared as {entry.kind}, and every write is cut off there")
+            return Proven(f"`{field}` is declared as {entry.kind}, and every write is clamped to it")
         if entry.fresh_bounds is None:
             return NotProven(f"`{field}` holds {entry.kind}", entry.writers)
         if low <= entry.fresh_bounds[0] and entry.fresh_bounds[1] <= high:
@@ -406,18 +408,18 @@ def _hull(parts: Sequence[Bounds]) -> Bounds:
 # As text for people, and as plain data for JSON
 
 SCHEMA = 1
-"""The version of the JSON form. It changes when a key changes its meaning or goes; new keys may come without."""
+"""The version of the JSON form. It changes when a key changes its meaning or is removed, not when keys are added."""
 
 
 def ledger_text(ledger: Ledger) -> str:
-    """The whole ledger, ends with a line break; equal rules give equal texts."""
+    """The whole ledger, ending with a line break; equal rules give equal texts."""
     head = [
         f"ledger of {ledger.name}: {len(ledger.elements)} elements, {len(ledger.rules)} lines of rules",
-        "What is not listed cannot happen: in worlds of any size and content, with any parameters.",
+        "Effects that are not listed cannot happen, in worlds of any size and content, with any parameters.",
     ]
     if not ledger.complete:
         head.append(
-            "Not decided in full: the rules are too many. What could not be excluded in time is listed."
+            "Incomplete: there are too many rules. Effects that could not be excluded in time are listed."
         )
     blocks: list[Iterable[str]] = [head, _sums(ledger), _sources(ledger)]
     blocks += [_element(ledger, name) for name in ledger.elements]
@@ -441,7 +443,7 @@ def _sources(ledger: Ledger) -> Iterator[str]:
     standing = [name for name in ledger.elements if ledger.unchanged(name)]
     yield "elements"
     yield f"  no rule makes: {_listed(never)}"
-    yield f"  made only in worlds that hold them already: {_listed(copied)}"
+    yield f"  made only in worlds that already contain them: {_listed(copied)}"
     yield f"  stay in place permanently: {_listed(standing)}"
 
 
@@ -453,7 +455,7 @@ TREND_WORDS = {"constant": "is constant", "not decided": "may rise and fall"}
 
 
 def trend_text(ruleset: Ruleset, number: int) -> str:
-    """What the ledger says about the number of cells of one element, in little time; empty if that does not suffice."""
+    """The trend of the number of cells of one element, as text; empty if finding it would take too long."""
     facts = replace(facts_of(ruleset), budget=Budget(QUICK, MAX_QUESTION))
     trends = {(True, True): "not decided", (True, False): "never falls", (False, True): "never rises"}
     trend = trends.get(may_rise_and_fall(ruleset, facts, number), "constant")
@@ -487,10 +489,10 @@ def _rules(ledger: Ledger) -> Iterator[str]:
     for entry in ledger.rules:
         yield f"  {_place(entry.rule)}: {entry.rule.text}"
         if not entry.fires:
-            yield "    never happens: no cell of any world can fulfill it"
+            yield "    never fires: no cell of any world can fulfill it"
         elif entry.needs:
             needs = [ids[0] if len(ids) == 1 else f"one of ({', '.join(ids)})" for ids in entry.needs]
-            yield f"    never happens without {', and without '.join(needs)}"
+            yield f"    never fires without {', and without '.join(needs)}"
 
 
 def _fields(ledger: Ledger) -> Iterator[str]:
@@ -520,7 +522,7 @@ def _overlaps(ledger: Ledger) -> Iterator[str]:
 
 
 def ledger_data(ledger: Ledger) -> dict[str, Any]:
-    """The ledger as plain data: the form is in docs/testing.md. Lines of rules are numbers of `rules`, from 0."""
+    """The ledger as plain data. Lines of rules are numbers of `rules`, from 0."""
     numbers = {entry.rule: number for number, entry in enumerate(ledger.rules)}
     return {
         "schema": SCHEMA,

@@ -1,4 +1,4 @@
-"""Proofs of claims without a test: from the ledger, from how far rules see, or from the claim itself."""
+"""Proofs of claims without running a world: from the ledger, from the reach of rules, or from the claim itself."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def prove(claim: Claim, ruleset: Ruleset, ledger: Ledger, without: frozenset[int
                 return Proven(f"no rule changes `{claim.field}`")
             verdicts = [ledger.within(claim.field, claim.lo, claim.hi)]
         case Local() if (reach := horizon(ruleset)) <= claim.radius:
-            return Proven(f"what a cell holds depends on nothing beyond {reach} cells")
+            return Proven(f"a cell depends on nothing beyond {reach} cells")
         case Never() if not satisfiable(facts_of(ruleset), [(claim.condition, (0, 0))]):
             return Proven("no cell can fulfill the condition", by="search")
     proofs = [verdict for verdict in verdicts if isinstance(verdict, Proven)]
@@ -56,7 +56,7 @@ def _prove_count(trend: str, counted: set[str], ledger: Ledger, without: list[st
     changes = ((before in counted, after in counted) for _, before, after in ledger.possible(cells))
     if any(TREND_BREAKS[trend](after, before) for before, after in changes):
         return None
-    return Proven("no rule that can happen in such worlds changes the number so")
+    return Proven("no rule that can fire in such worlds changes the number in this way")
 
 
 def _names(ruleset: Ruleset, ids: Iterable[int]) -> list[str]:
@@ -64,13 +64,13 @@ def _names(ruleset: Ruleset, ids: Iterable[int]) -> list[str]:
     return [element.name for element in ruleset.elements if element.id in wanted]
 
 
-# How far a step sees
+# The reach of a step
 
 
 def horizon(ruleset: Ruleset) -> int:
     """An upper bound on the rows and columns away at which a cell may affect another one within a step.
 
-    Each substep sees what the substeps before it saw around each cell that it reads. `step` and `row` are not cells.
+    Each substep sees what earlier substeps saw around each cell that it reads. `step` and `row` are not cells.
     """
     seen = 0
     for pass_ in ruleset.passes:
@@ -87,7 +87,7 @@ def _substep_reach(moment: Moment, seen: int, lets: Mapping[str, int]) -> int:
     masks = {id(rule): _sight(rule.mask, seen, lets) for rule in moment.rules}
     reaches = [_length(rule.offset) for rule in claims if not isinstance(rule, Transform)]
     if moment.policy in ("drop_both", "first_wins") and claims:
-        # A rule must know where the others claim cells; earlier rules decide one after the other.
+        # A rule depends on the cells that others claim; under `first_wins`, these in turn depend on earlier rules.
         rounds = len(claims) if moment.policy == "first_wins" and reaches else 1
         widest = max(masks[id(rule)] for rule in claims)
         wide = widest + 2 * max(reaches, default=0) * rounds

@@ -56,11 +56,11 @@ class Type:
 
 
 def dtype(name_or_type: Any) -> Type:
-    """A type by its name, or Python's."""
+    """Return the type with this name, or the one for a Python type."""
     name = name_or_type.__name__ if isinstance(name_or_type, type) else str(name_or_type)
     name = {"int": "int64", "float": "float64"}.get(name, name)
     if name not in _TYPES:
-        raise TypeError(f"{name_or_type!r} is not a type of numbers that is known without NumPy")
+        raise TypeError(f"{name_or_type!r} is not a number type that powderdsl supports without NumPy")
     return _TYPES[name]
 
 

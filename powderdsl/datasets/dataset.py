@@ -572,7 +572,9 @@ def split(
         selected._select(_Episodes(*(column[part == number] for column in episodes)))
         if not len(selected):
             count = len(rows.worlds) if by == "world" else len(episodes.number)
-            raise ValueError(f"part {number} would be empty: {count} {by}s are too few, or take another seed")
+            raise ValueError(
+                f"part {number} would be empty: {count} {by}s are too few, or choose another seed"
+            )
         parts.append(selected)
     return tuple(parts)
 

@@ -36,7 +36,7 @@ DATA = "data"
 
 
 def require_minari() -> None:
-    """Raises CompileError (PD612) if Minari or h5py is not installed."""
+    """Raise CompileError (PD612) if Minari or h5py is not installed."""
     for module in ("h5py", "minari"):
         require(module, "reading and writing Minari datasets", "pip install 'powderdsl[minari]'")
 

@@ -157,7 +157,7 @@ def begin_manifest(folder: Path, recipe: Recipe) -> Manifest:
 def add_shard(
     folder: Path, manifest: Manifest, number: int, parts: Mapping[str, Sequence[Array]]
 ) -> Manifest:
-    """Write a shard from arrays in parts, and the manifest with it, which is returned."""
+    """Write a shard from arrays in parts, and return the manifest with it."""
     row = write_shard(folder, number, parts, compress=manifest.recipe.compress)
     shards = sorted((*manifest.shards, row), key=lambda shard: shard.number)
     manifest = replace(manifest, shards=tuple(shards))
@@ -169,7 +169,7 @@ def add_shard(
 
 
 class _Recording:
-    """Plays the episodes of all missing shards, in order, and writes each shard when its last episode has ended."""
+    """Plays the episodes of all missing shards in order, and writes each shard when its last episode ends."""
 
     def __init__(
         self,

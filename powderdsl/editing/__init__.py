@@ -1,1 +1,1 @@
-"""Completion, hover texts, places of names, and one layout of files, for editors."""
+"""Completion, hover texts, positions of names, and the standard layout of files, for editors."""

@@ -1,4 +1,4 @@
-"""A cursor in a file: the keys above it, the key whose value it is in, and its word."""
+"""A cursor in a file: the keys above it, the key of the value that it is in, and its word."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ INDENT = re.compile(r"\s*(?:-\s+)*")
 
 @dataclass(frozen=True)
 class Cursor:
-    """A place in a text.
+    """A place in a text. `path` has the keys above it, from the top.
 
-    `path` has the keys above it, from the top. `key` is the key whose value it stands in, None where a key is written.
-    `start` and `end` are the offsets of the word around it.
+    `key` is the key of the value that it is in, or None for a key. `start` and `end` are the offsets of the word
+    around it.
     """
 
     path: tuple[str, ...]
@@ -29,7 +29,7 @@ class Cursor:
 
     @property
     def keys(self) -> tuple[str, ...]:
-        """The keys down to the value that it stands in."""
+        """The keys down to the value at the cursor."""
         return self.path if self.key is None else (*self.path, self.key)
 
 
@@ -51,20 +51,20 @@ def cursor_at(text: str, offset: int) -> Cursor:
 
 
 def _width(line: str) -> int:
-    """The column of a line's content; `- ` belongs to what stands before it."""
+    """The column of a line's content; `- ` belongs to the indentation."""
     match = INDENT.match(line)
     return match.end() if match else 0
 
 
 def _outer(above: list[str], line: str, before: str) -> tuple[tuple[str, ...], str | None]:
-    """The path by indentation, and the key of the line if the cursor stands behind it."""
+    """The path by indentation, and the key of the line if the cursor is behind it."""
     own = KEY.match(line)
     inside = own is not None and len(before) > own.end("key")
     limit = _width(line) if line.strip() else len(before)
     path: list[str] = []
     is_item = line.lstrip().startswith("-")
     if is_item:
-        limit = len(line) - len(line.lstrip()) + 1  # the key of a list may stand at the column of its dashes
+        limit = len(line) - len(line.lstrip()) + 1  # the key of a list may be in the column of its dashes
     for other in reversed(above):
         match = KEY.match(other)
         if (
@@ -104,7 +104,7 @@ def _inner(before: str, path: tuple[str, ...], key: str | None) -> tuple[tuple[s
     return path, key
 
 
-# What may stand there, by the schema
+# Completions at the cursor, by the schema
 
 
 def parts_at(path: tuple[str, ...], kind: str) -> list[dict[str, Any]]:
@@ -117,7 +117,7 @@ def parts_at(path: tuple[str, ...], kind: str) -> list[dict[str, Any]]:
 
 
 def _alternatives(part: dict[str, Any]) -> Iterator[dict[str, Any]]:
-    """The schemas that a value may have, items of lists included: references and choices are followed."""
+    """The schemas that a value may have, including those of list items; references and choices are followed."""
     if "$ref" in part:
         yield from _alternatives(schema()["definitions"][part["$ref"].rpartition("/")[2]])
     for choice in part.get("anyOf", ()):
@@ -143,7 +143,7 @@ def _below(part: dict[str, Any], key: str) -> Iterator[dict[str, Any]]:
 
 
 def keys_at(path: tuple[str, ...], kind: str) -> dict[str, str]:
-    """The keys that may stand below some keys, with their meanings."""
+    """The keys that are allowed below some keys, with their meanings."""
     keys: dict[str, str] = {}
     for part in parts_at(path, kind):
         keys |= {key: value.get("description", "") for key, value in part.get("properties", {}).items()}
@@ -151,5 +151,5 @@ def keys_at(path: tuple[str, ...], kind: str) -> dict[str, str]:
 
 
 def values_at(path: tuple[str, ...], kind: str) -> list[str]:
-    """The words that a value must be one of, if there are such."""
+    """The words that a value must be one of, if any."""
     return [word for part in parts_at(path, kind) for word in part.get("enum", ()) if isinstance(word, str)]

@@ -1,4 +1,4 @@
-"""The JSON Schema of all files: keys, what they mean, and which values they take."""
+"""The JSON Schema of all files: keys, their meanings and their values."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ MADE = Path(__file__).parents[1] / "data" / "schema.json"
 
 @cache
 def schema() -> dict[str, Any]:
-    """The JSON Schema of all kinds of files: the first key that a file has decides."""
+    """The JSON Schema of all kinds of files. The first key of a file determines its kind."""
     if MADE.is_file():
         return dict(json.loads(MADE.read_text(encoding="utf-8")))
     from powderdsl.experiments.studies.study import AxisDecl, Measure, StudyDecl

@@ -1,7 +1,7 @@
-"""One layout for YAML files: indentation, blanks and blank lines. Comments and what the file says stay.
+"""The standard layout of YAML files: indentation, blanks and blank lines. Comments and contents are preserved.
 
-Keys stand two columns right of the key above them, items of a list two columns right of theirs. Lines that are parts of one
-value, such as a drawing, keep their distance from its first line.
+Keys are two columns right of the key above them, items of a list two columns right of theirs. Lines that are parts of
+one value, such as a drawing, keep their distance from its first line.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ GAP = re.compile(r"""^(\s*(?:-\s+)*(?:"[^"]*"|[^\s#"'{\[|>-][^#:]*?):)[ \t]+(?=[
 
 
 def formatted(source: Source, reporter: Reporter) -> str | None:
-    """The text of a file in the one layout; None after reporting that it is not YAML."""
+    """The text of a file in the standard layout; None after reporting that it is not YAML."""
     tree = parse_yaml(source, reporter)
     if tree is None:
         return None
@@ -32,7 +32,7 @@ def formatted(source: Source, reporter: Reporter) -> str | None:
             held = []
         elif number in columns:
             shift = columns[number] - _indent(line)
-            # Comments stand with what follows them.
+            # Comments belong to the line that follows them.
             out += [_moved(other, columns[number] - _indent(other)) for other in held]
             held = []
             out.append(_moved(GAP.sub(r"\1 ", re.sub(r"^(\s*(?:- )*-)\s+", r"\1 ", line.rstrip())), shift))
@@ -46,7 +46,7 @@ def formatted(source: Source, reporter: Reporter) -> str | None:
 
 
 def _columns(node: Node, column: int) -> Iterator[tuple[int, int]]:
-    """The lines that begin with a key, a dash or more of a value, and the column of each."""
+    """The lines that begin with a key, a dash or the rest of a value, and the column of each."""
     if isinstance(node, Scalar):
         if node.style != "block":
             yield from ((line, column) for line in _lines_of(node))
@@ -63,7 +63,7 @@ def _columns(node: Node, column: int) -> Iterator[tuple[int, int]]:
 
 
 def _texts(node: Node, column: int, lines: list[str], outer: int = -1) -> Iterator[tuple[int, int]]:
-    """The lines of text in blocks, and how far each moves. `outer` is the column now of the key or dash above."""
+    """The lines of text in blocks, and how far each moves. `outer` is the current column of the key or dash above."""
     if isinstance(node, Mapping):
         for key, value in node.entries:
             yield from _texts(value, column + STEP, lines, key.span.column - 1)
@@ -87,7 +87,7 @@ def _indent(line: str) -> int:
 
 
 def _moved(line: str, shift: int) -> str:
-    """A line some columns further right."""
+    """A line moved right by some columns."""
     if not line.strip():
         return line if shift == 0 else line[: max(0, len(line) + shift)] if shift < 0 else line
     return " " * max(0, _indent(line) + shift) + line.lstrip(" ")

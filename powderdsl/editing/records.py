@@ -9,10 +9,10 @@ from powderdsl.model.schema import MAX_NAME, Entry, Key, Record, keys_of
 Schema = dict[str, Any]
 
 SCALAR: Schema = {"type": ["string", "number", "boolean"]}
-"""A single value. Files read it as text, whatever YAML takes it for."""
+"""A single value. Files read it as text, regardless of its YAML type."""
 
 NAMES: Schema = {"pattern": f"^[A-Za-z_][A-Za-z0-9_]{{0,{MAX_NAME - 1}}}$"}
-"""Keys that are new names."""
+"""Keys that define names."""
 
 
 def one_or_list(item: Schema) -> Schema:
@@ -27,7 +27,7 @@ def _word(row: Key) -> Schema:
 
 
 def entries(item: Schema, *, names: bool = True) -> Schema:
-    """A mapping from keys, which are new names unless `names` is false, to items; or nothing."""
+    """A mapping from keys, which define names unless `names` is false, to items; or nothing."""
     return {
         "type": ["object", "null"],
         "additionalProperties": item,
@@ -36,7 +36,7 @@ def entries(item: Schema, *, names: bool = True) -> Schema:
 
 
 class JsonSchema:
-    """Makes references to records, and their definitions.
+    """Creates references to records, and their definitions.
 
     `values` has the schemas of values that declarations leave open, by record and key.
     """
@@ -52,7 +52,7 @@ class JsonSchema:
         return {"$ref": f"#/definitions/{name}"}
 
     def definitions(self) -> dict[str, Schema]:
-        """The definitions of all records that have been referred to, here or in another definition."""
+        """The definitions of all records that were referred to, here or in another definition."""
         made: dict[str, Schema] = {}
         while missing := [name for name in self._kinds if name not in made]:
             made |= {name: self._definition(name, self._kinds[name]) for name in missing}

@@ -1,4 +1,4 @@
-"""The words of loaded rules: what each names, where it is defined, and where it occurs."""
+"""The words of loaded rules: their meanings, definitions and occurrences."""
 
 from __future__ import annotations
 
@@ -36,15 +36,15 @@ KINDS: dict[type[Definition], str] = {
     StreamDecl: "stream",
     PassDecl: "pass",
 }
-"""What definitions are called."""
+"""Names of the kinds of definitions."""
 
 TEXT = re.compile(r'(^|\s)#.*$|\babout:\s*("[^"]*"|[^,}\n]*)', re.MULTILINE)
-"""Comments and sentences: no names stand in them."""
+"""Comments and sentences, which contain no names."""
 
 
 @dataclass(frozen=True)
 class Word:
-    """A word of the rules. `span` is where a file defines it; words of the language have none."""
+    """A word of the rules. `span` is its definition in a file; words of the language have none."""
 
     name: str
     kind: str
@@ -80,7 +80,7 @@ def language_words() -> tuple[Word, ...]:
 
 
 def occurrences(name: str, sources: Iterable[Source]) -> Iterator[Span]:
-    """The places of a name in the lines of files."""
+    """The places where a name occurs in the lines of files."""
     pattern = re.compile(rf"(?<![\w]){re.escape(name)}(?![\w])")
     for source in sources:
         hidden = [match.span() for match in TEXT.finditer(source.text)]

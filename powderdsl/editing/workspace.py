@@ -31,7 +31,7 @@ PACKS = ("needs", "packs", "without", "provides", "conflicts", "extends", "rules
 
 @dataclass(frozen=True)
 class Item:
-    """A completion: a word, what kind of word, and what it means."""
+    """A completion: a word, its kind, and its meaning."""
 
     label: str
     kind: str
@@ -57,7 +57,7 @@ class Rules:
     words: dict[str, list[Word]] = field(default_factory=dict)
 
     def read(self, names: Sequence[str | Path]) -> None:
-        """Read the packs that some names mean; the last ones stay if there are none."""
+        """Read the packs with some names; keep the previous ones if there are none."""
         if packs := read(names, Reporter())[0]:
             self.packs, self.words = packs, {}
             for word in (*language_words(), *definitions(packs)):
@@ -71,8 +71,8 @@ class Rules:
 class Workspace:
     """The open files.
 
-    `beside` names rules that packs are checked with, besides those that they need. `commands` gives the commands that steps
-    of studies may call.
+    `beside` names rules to check packs with, in addition to those that they need. `commands` gives the commands that
+    steps of studies may call.
     """
 
     def __init__(self, beside: str = "", commands: Callable[[], Commands] = dict):
@@ -80,11 +80,11 @@ class Workspace:
         self.rules: dict[Path, Rules] = {}
 
     def open(self, path: Path, text: str) -> None:
-        """A file is open, or its text has changed."""
+        """Note that a file is open, or that its text has changed."""
         OPEN[path.resolve()] = text
 
     def close(self, path: Path) -> None:
-        """A file is no longer open."""
+        """Note that a file was closed."""
         OPEN.pop(path.resolve(), None)
         self.rules.pop(path, None)
 
@@ -92,7 +92,7 @@ class Workspace:
         return OPEN[path.resolve()]
 
     def kind(self, path: Path) -> str:
-        """The key that says what a file is; `pack` if none does yet."""
+        """The key that determines the kind of a file; `pack` if there is none yet."""
         return kind_of(self.text(path))
 
     # Mistakes
@@ -100,7 +100,7 @@ class Workspace:
     def check(self, path: Path) -> tuple[Diagnostic, ...]:
         """The diagnostics of `powderdsl check --quick --notes` for a file, in all files that it needs.
 
-        Nothing of other YAML files, which have none of our first keys.
+        Other YAML files, which have none of our first keys, get none.
         """
         if not KIND.search(self.text(path)):
             return ()
@@ -135,7 +135,7 @@ class Workspace:
     # At a place
 
     def complete(self, path: Path, offset: int) -> list[Item]:
-        """The words that fit at a place."""
+        """The words that are allowed at a place."""
         beside = sorted(other.stem for other in path.parent.glob("*.yaml") if other != path)
         return completions(self.text(path), offset, self._rules(path), beside)
 
@@ -162,19 +162,19 @@ class Workspace:
         return [span for span in places if _namespace(cursor_at(span.source.text, span.start)) == own]
 
     def rename(self, path: Path, offset: int, name: str) -> list[Span]:
-        """The places to write another name. Raises ValueError if that would change what the rules say."""
+        """The places to rename. Raises ValueError if the new name would change the meaning of rules."""
         spans, rules = self.references(path, offset), self._rules(path)
         if not spans:
-            raise ValueError("this is not a name that a file defines")
+            raise ValueError("no file defines this name")
         if not NAME.match(name) or name in RESERVED or name in reserved_words():
             raise ValueError(f"`{name}` cannot be a name")
         if name in rules.words:
-            raise ValueError(f"`{name}` is a name already")
+            raise ValueError(f"`{name}` is already a name")
         shipped_here = shipped("rules").resolve()
         for span in spans:
             file = Path(span.source.name).resolve()
             if file.parent == shipped_here and file not in OPEN:
-                raise ValueError(f"{span.source.name} comes with powderdsl and uses it, too")
+                raise ValueError(f"{span.source.name} comes with powderdsl and uses this name")
         return spans
 
     def outline(self, path: Path) -> tuple[Symbol, ...]:
@@ -189,13 +189,14 @@ class Workspace:
 
 
 def kind_of(text: str) -> str:
-    """The key that says what a file is; `pack` if none does yet."""
+    """The key that determines the kind of a file; `pack` if there is none yet."""
     match = KIND.search(text)
     return match[1] if match else "pack"
 
 
 def completions(text: str, offset: int, rules: Rules, beside: Iterable[str]) -> list[Item]:
-    """The words that fit at a place of a text. `beside` are packs that may be named, besides shipped ones."""
+    """The words that are allowed at a place of a text. `beside` are packs that may be named, in addition to shipped
+    ones."""
     cursor, kind = cursor_at(text, offset), kind_of(text)
     if cursor.key is None and (keys := keys_at(cursor.path, kind)):
         return [Item(key, "key", about) for key, about in keys.items()]

@@ -143,7 +143,7 @@ def _write(program: LevelProgram, path: Path, recipe: Recipe, report: Callable[[
         )
     if path.exists():
         if written is None:
-            raise ValueError(f"{path} is there already, and {about.name} is not: choose another folder")
+            raise ValueError(f"{path} exists, but {about.name} does not: choose another folder")
         report(recipe.count)
         return
     parts.mkdir(exist_ok=True)

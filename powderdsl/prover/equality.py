@@ -33,7 +33,7 @@ from powderdsl.prover.symbolic import (
 
 @dataclass(frozen=True)
 class Difference:
-    """A question whose answer is a world on which some passes differ, in some slots: its model is that of `moment`."""
+    """A question whose answer is a world on which some passes differ, in some slots; its model is that of `moment`."""
 
     moment: Moment
     passes: tuple[tuple[int, ...], tuple[int, ...]]
@@ -54,7 +54,7 @@ class Side:
 
 
 class Shared:
-    """A world of variables, whose numbers have the ranges that both sides share, as one side reads it."""
+    """A world of variables, with the ranges that both sides share, as one side reads it."""
 
     def __init__(self, before: Before, own: Mapping[str, Layout], shared: Mapping[str, Layout]) -> None:
         self.before = before
@@ -76,22 +76,23 @@ class Shared:
 
 
 def why_incomparable(first: Ruleset, second: Ruleset) -> str | None:
-    """The reason why the worlds of two rulesets are not of one kind, or None: elements, slots and what fresh cells hold."""
+    """The reason why the worlds of two rulesets are of different kinds, or None: elements, slots and values of fresh
+    cells."""
 
     def state(slot: Slot, ruleset: Ruleset) -> object:
         usual = fresh_values(ruleset, slot)
         return slot.kind.name, slot.resets, slot.of, [usual[element.id] for element in ruleset.elements]
 
     if [(e.id, e.name) for e in first.elements] != [(e.id, e.name) for e in second.elements]:
-        return "they have other elements"
+        return "they have different elements"
     states = [{slot.name: state(slot, ruleset) for slot in slots(ruleset)} for ruleset in (first, second)]
     if states[0].keys() != states[1].keys():
-        return "their cells hold other fields"
+        return "their cells have different fields"
     for name, value in states[0].items():
         if value != states[1][name]:
-            return f"`{name}` is of another kind, or fresh cells hold another one"
+            return f"`{name}` has another kind, or another value in fresh cells"
     if first.side_multiple != second.side_multiple:
-        return "their worlds have other sides"
+        return "their worlds have different sides"
     return None
 
 
@@ -109,13 +110,11 @@ def has_own_parameters(first: Side, second: Side) -> bool:
 
 
 def differs(first: Side, second: Side, budget: Budget) -> Difference | None:
-    """Return None if two rulesets with the same state are proven equal, else the first difference of passes.
-
-    Where parameters have other values, each ruleset has its own. Raises Undecided and NotBits.
-    """
+    """Return None if two rulesets with the same state are proven equal, else the first difference of passes. Where
+    their parameters differ, each ruleset uses its own. Raises Undecided and NotBits."""
     draws = {s.name: s.bits for s in first.ruleset.streams}
     if any(draws.get(second.names.stream(s.name), s.bits) != s.bits for s in second.ruleset.streams):
-        raise Undecided("draws of other sizes")
+        raise Undecided("draws of different sizes")
     fixed = has_own_parameters(first, second)
     try:
         groups = _groups(first, second, fixed)
@@ -123,7 +122,7 @@ def differs(first: Side, second: Side, budget: Budget) -> Difference | None:
         difference = next((difference for difference in differences if difference), None)
         if (
             difference and all(difference.passes) and difference.passes[0][0]
-        ):  # show it by what the step begins with
+        ):  # the difference shows in the values at the start of a step
             until = tuple(range(difference.passes[0][-1] + 1)), tuple(range(difference.passes[1][-1] + 1))
             with suppress(Undecided, OutOfWork, NotBits):
                 shown = _differ(first, second, until, Budget.of(1), fixed, MAX_WHOLE)
@@ -137,7 +136,7 @@ Numbers = tuple[tuple[int, ...], tuple[int, ...]]
 
 
 def _groups(first: Side, second: Side, fixed: bool) -> list[Numbers]:
-    """The passes to compare, without those that are the same and read the same: one by one if all have the same names."""
+    """The passes to compare, except identical ones that read the same values: one by one if all have the same names."""
     a, b = first.program.passes, second.program.passes
     words = *second.names.params.items(), *second.names.streams.items()
     wholes = [replace(side.program, name="", passes=()) for side in (first, second)]
@@ -206,7 +205,7 @@ def _extended(world: World, row: Layout, count: int) -> list[Literal]:
 
 
 def _narrower(a: Layout, b: Layout) -> Layout:
-    """The values that both rows hold."""
+    """The values that both rows contain."""
     lo, hi = max(a.lo, b.lo), min(a.hi, b.hi)
     if lo > hi:
         raise Undecided("ranges that share no number")

@@ -1,4 +1,4 @@
-"""Claims that hold by induction: each pass of a step keeps them, whatever the well-formed world before it was."""
+"""Claims that hold by induction: each pass of a step preserves them, from any well-formed world."""
 
 from __future__ import annotations
 
@@ -34,14 +34,14 @@ from powderdsl.prover.symbolic import (
 HERE: Cell = (0, 0)
 
 MAX_WHOLE = 40_000
-"""Gates and terms of a pass that is looked at as a whole."""
+"""Maximum number of gates and terms of a pass that is examined as a whole."""
 
 ARRIVING = [(0, -1), (1, -1), (2, 0)]
 READS = {"shift": [(0, 1)], "swap": [*ARRIVING, (0, 1), (1, 0)], "arrive": ARRIVING}
-"""Which arguments a node reads in other cells: at its offset (1), opposite to it (-1) or here (0)."""
+"""The cells in which a node reads its arguments: at its offset (1), opposite to it (-1) or here (0)."""
 
 Law = Callable[["Moment", World, Cell], Literal]
-"""A function that says whether a claim holds at a cell of a world of a moment."""
+"""Returns a literal that is true if a claim holds at a cell of a world of a moment."""
 
 
 @dataclass(eq=False)
@@ -51,17 +51,17 @@ class Moment:
     name: str
     symbols: Symbols
     starts: tuple[World, ...]
-    """Worlds that are well-formed; laws are known to hold in the last one."""
+    """Well-formed worlds; laws are known to hold in the last one."""
     before: World
     after: World
     ranges: Ranges = field(default_factory=dict)
     evaluation: Evaluation | None = None
     moves: tuple[tuple[Node, Offset], ...] = ()
-    """Flags of cells that exchange something with a neighbor, and where that is."""
+    """Flags of cells that exchange something with a neighbor, and the offset of that neighbor."""
     only_moves: bool | None = None
-    """True if the moment only exchanges elements between cells, None until that is known."""
+    """True if the moment only exchanges elements between cells; None if that is unknown."""
     model: Model | None = None
-    """The answer to the last question, if there was one."""
+    """The answer to the last question, if any."""
     _facts: dict[object, list[Literal]] = field(default_factory=dict)
     _evaluations: dict[int, Evaluation] = field(default_factory=dict)
 
@@ -75,12 +75,13 @@ class Moment:
         return evaluation.value(node, *cell)
 
     def keeps(self, law: Law, given: Sequence[Law] = ()) -> bool:
-        """Return whether the law holds in a cell afterwards if it held in all cells before. Raises OutOfWork and Undecided."""
+        """Return whether the law holds in a cell afterwards if it held in all cells before. Raises OutOfWork,
+        Undecided."""
         broken = law(self, self.after, HERE) ^ 1
         return broken in (FALSE, law(self, self.before, HERE) ^ 1) or not self.can_be([broken], [law, *given])
 
     def can_be(self, literals: Sequence[Literal], laws: Iterable[Law] = ()) -> bool:
-        """Return whether literals can hold at once, in well-formed worlds where some laws hold in all cells.
+        """Return whether literals can be true at once, in well-formed worlds where some laws hold in all cells.
 
         Raises OutOfWork and Undecided.
         """
@@ -97,7 +98,7 @@ class Moment:
         return answer
 
     def _well_formed(self, cell: Cell, planes: Iterable[str]) -> list[Literal]:
-        """Demand that a cell of the starts is well-formed, as far as it concerns some planes; return the facts."""
+        """Require that a cell of the starts is well-formed, in some planes; return the facts."""
         key = (cell, *planes)
         if key not in self._facts:
             facts = [
@@ -125,10 +126,7 @@ def growing_ranges(program: Program) -> list[Ranges]:
 
 
 class Prover:
-    """Proves claims about one ruleset, with a budget for all of them.
-
-    Raises NotBits for a ruleset with a pass that bit planes cannot carry.
-    """
+    """Proves claims about one ruleset, with one budget for all. Raises NotBits if bit planes cannot express a pass."""
 
     def __init__(self, ruleset: Ruleset, budget: Budget) -> None:
         self.ruleset, self.budget = ruleset, budget
@@ -150,7 +148,8 @@ class Prover:
         return Moment("start", symbols, (before,), before, Reset(before, symbols))
 
     def broken_by(self, check: Callable[[Moment], bool], *, everywhere: bool = False) -> Moment | None:
-        """The first moment of a step that fails a check. Unless it must hold `everywhere`, a pass as a whole may pass it."""
+        """The first moment of a step that fails a check. Unless the check must hold `everywhere`, it may hold for a
+        whole pass."""
         if not check(self.start):
             return self.start
         for number, pass_ in enumerate(self.planes):
@@ -167,7 +166,7 @@ class Prover:
         return None
 
     def _failed(self, number: int, place: int, check: Callable[[Moment], bool]) -> Moment | None:
-        """None if a substep passes a check: from any well-formed world, or from what the substeps before it leave."""
+        """None if a substep passes a check: from any well-formed world, or from the results of the substeps before it."""
         failed = None
         for cut in (True, False) if place else (False,):
             moment = self.moments(number, cut=cut)[place]
@@ -181,8 +180,8 @@ class Prover:
         return failed
 
     def moments(self, number: int, *, cut: bool) -> list[Moment]:
-        """The substeps of a pass, from any well-formed world if `cut`; otherwise from what those before it leave, and then the
-        pass as a whole."""
+        """The substeps of a pass, from any well-formed world if `cut`; otherwise from the results of earlier ones,
+        followed by the pass as a whole."""
         if (number, cut) not in self._moments:
             self._moments[number, cut] = self._make_moments(number, cut)
         return self._moments[number, cut]
@@ -214,8 +213,8 @@ class Prover:
         return moments if cut else [*moments, whole]
 
     def broken(self, claim: Claim, without: frozenset[int] = frozenset()) -> Moment | None:
-        """Return None if the claim is proven for worlds that start without some elements; else a moment that may break it, whose
-        model shows how. Raises OutOfWork and Undecided."""
+        """Return None if the claim is proven for worlds that start without some elements; else a moment that may
+        break it, with a model of how. Raises OutOfWork and Undecided."""
         given = [self.reachable(without)] if without else []
         passes = range(len(self.planes))
         match claim:
@@ -224,7 +223,7 @@ class Prover:
             case Total(ids=frozenset() as ids):
                 for number in sorted(
                     passes, key=self._failures.count, reverse=True
-                ):  # where others failed, first
+                ):  # passes that failed before come first
                     if moment := self._counted(number, ids, claim.trend, given):
                         self._failures.append(number)
                         return moment
@@ -261,7 +260,7 @@ class Prover:
         )
 
     def reachable(self, gone: frozenset[int]) -> Law:
-        """Return the law that names the elements of cells and fields if worlds start without some."""
+        """Return the law that limits the elements of cells and fields if worlds start without some."""
         if gone not in self._laws:
             self._laws[gone] = self._make_law(gone)
         return self._laws[gone]
@@ -269,14 +268,14 @@ class Prover:
     def _make_law(self, gone: frozenset[int]) -> Law:
         rows = [row for row in self.start.symbols.layouts.values() if row.slot.kind.name == "element"]
         known = set(self.start.symbols.ids) - gone
-        # The usual element of a field, gone or not, is in fresh cells, and in those that can hold no other.
+        # A field's usual element, absent or not, is in fresh cells and in cells that can contain no other.
         allowed = {row.slot.name: known | {row.usual[i] or 0 for i in known} for row in rows}
 
         def law(moment: Moment, world: World, cell: Cell) -> Literal:
             net = moment.symbols.net
             return net.all(net.member(row.bits(world, *cell), allowed[row.slot.name]) for row in rows)
 
-        # What a moment adds is allowed from now on.
+        # Elements that a moment adds are allowed from now on.
         while moment := self.broken_by(lambda moment: moment.keeps(law), everywhere=True):
             for row in rows:
                 bits = map(moment.questions.holds, row.bits(moment.after, *HERE))
@@ -284,7 +283,7 @@ class Prover:
         return law
 
     def _never_for(self, claim: Never, given: Sequence[Law]) -> Moment | None:
-        """Return whether a condition can hold in a cell for several steps in a row: whole steps, one after the other."""
+        """Return whether a condition can hold in a cell for several successive steps."""
         if claim.steps > 2 and any(map(_reads_clock, self.planes)):
             raise Undecided("the clock")
         symbols, condition = self._symbols(), self._condition(claim)
@@ -294,7 +293,7 @@ class Prover:
         for step in range(claim.steps - 1):
             names = Names(
                 streams={s.name: f"{s.name} {step}" for s in self.ruleset.streams}
-            )  # each step draws anew
+            )  # each step draws new numbers
             world = Reset(world, symbols)
             for pass_ in self.planes:
                 world = Evaluation(world, symbols, names).after(pass_.outputs)
@@ -302,7 +301,7 @@ class Prover:
         return moment if moment.can_be(holds, given) else None
 
     def well_formed(self) -> Moment | None:
-        """The first pass or substep that may leave a cell that is not well-formed; None if all keep them."""
+        """The first pass or substep that may leave a cell that is not well-formed; None if there is none."""
 
         def keeps(moment: Moment) -> bool:
             after, before = (moment.symbols.well_formed(w, HERE) for w in (moment.after, moment.before))
@@ -330,7 +329,7 @@ class Prover:
         return next((moment for i in changing if (moment := self._failed(number, i, keeps))), None)
 
     def _only_moves(self, moment: Moment) -> bool:
-        """Return whether a substep only exchanges elements between cells: then it changes no number at all."""
+        """Return whether a substep only exchanges elements between cells, which changes no number."""
         if moment.only_moves is not None:
             return moment.only_moves
         net, row = moment.symbols.net, moment.symbols.layouts["element"]
@@ -348,7 +347,7 @@ class Prover:
         return moment.only_moves
 
     def _matched(self, moment: Moment, ids: frozenset[int], trend: str, given: Sequence[Law]) -> bool:
-        """Return whether a substep keeps the number of cells with some elements to a trend."""
+        """Return whether the number of cells with some elements follows a trend in a substep."""
         net, row = moment.symbols.net, moment.symbols.layouts["element"]
 
         def counted(world: World, cell: Cell) -> Literal:
@@ -377,10 +376,10 @@ class Prover:
         breaks: Callable[[Sequence[Cell]], Literal],
         given: Sequence[Law],
     ) -> bool:
-        """Return whether a sum over all cells may change in a forbidden way, for all that matching shows.
+        """Return whether a sum over all cells may change in a forbidden way, as far as matching cells can show.
 
-        What moves matches cells in pairs, as far as they differ; other cells stay single. If no cell belongs to two pairs,
-        and no pair and no single cell breaks the rule, neither does the sum.
+        Moves match different cells in pairs; other cells stay single. If no cell belongs to two pairs, and no pair and no
+        single cell breaks the rule, the sum does not break it.
         """
         net = moment.symbols.net
         assert moment.evaluation is not None
@@ -416,11 +415,11 @@ class Prover:
     def _symmetric(self, number: int, turn: str) -> Moment | None:
         """Return None if a pass gives the turned world for a turned world and turned draws."""
         if any(slot.resets and slot.kind.name in ("direction", "vec2") for slot in slots(self.ruleset)):
-            raise Undecided("directions that are reset do not turn")
+            raise Undecided("directions that are reset are not rotated")
         before = Before(symbols := self._symbols())
         pass_, net = self.planes[number], symbols.net
         if any(node.type == REAL for _, node in pass_.outputs):
-            raise Undecided("floats in turned worlds")
+            raise Undecided("floats in rotated or mirrored worlds")
         turned = Turned(before, symbols, turn)
         plain = Turned(Evaluation(before, symbols).after(pass_.outputs), symbols, turn)
         symbols.turn = turned.place

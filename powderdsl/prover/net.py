@@ -15,9 +15,10 @@ FALSE, TRUE = 0, 1
 
 
 class Net:
-    """Makes gates: ``and``, ``xor``, ``choice`` (of the second input where the first holds, else the third), ``variable``.
+    """Creates gates: ``and``, ``xor``, ``choice`` (the second input if the first is true, else the third),
+    ``variable``.
 
-    Equal gates are one; gates of constants and of equal or opposite literals fold. Gate 0 is the constant.
+    Equal gates are one object; gates of constants and of equal or opposite literals fold. Gate 0 is the constant.
     """
 
     def __init__(self) -> None:
@@ -79,7 +80,7 @@ class Net:
         return self._gate("xor", *((a, b) if a < b else (b, a))) ^ sign
 
     def choice(self, condition: Literal, yes: Literal, no: Literal) -> Literal:
-        """`yes` where the condition holds, else `no`."""
+        """`yes` if the condition is true, else `no`."""
         if condition & 1:
             condition, yes, no = condition ^ 1, no, yes
         if condition == FALSE or yes == no:
@@ -124,18 +125,18 @@ class Net:
 
     def within(self, bits: Sequence[Literal], lo: int, hi: int, *, signed: bool) -> Literal:
         """Return whether a number lies in lo..hi."""
-        if signed:  # half of the range more: no sign is left
+        if signed:  # half the range more makes signed numbers unsigned
             half = 1 << (len(bits) - 1)
             bits, lo, hi = [*bits[:-1], bits[-1] ^ 1], lo + half, hi + half
         return self.and_(self.below(bits, hi + 1), self.below(bits, lo) ^ 1)
 
     def member(self, bits: Sequence[Literal], values: Iterable[int]) -> Literal:
-        """Return whether a number is one of some values, which may be negative."""
+        """Return whether a number equals one of some values, which may be negative."""
         whole = (1 << len(bits)) - 1
         return self._member(tuple(bits), sum(1 << value for value in {value & whole for value in values}))
 
     def _member(self, bits: tuple[Literal, ...], values: int) -> Literal:
-        """Return whether a number is one of those whose bits are set in `values`."""
+        """Return whether a number is in `values`, a bit set."""
         half = 1 << (len(bits) - 1) if bits else 0
         if not values or values == (1 << 2 * half) - 1 or not bits:
             return int(bool(values))
@@ -151,7 +152,7 @@ class Net:
         inputs = self.inputs
         stack = [*dict.fromkeys(literal >> 1 for literal in literals if literal > 1)]
         seen = set(stack)
-        for number in stack:  # it grows on the way
+        for number in stack:  # the list grows during the loop
             for below in inputs[number]:
                 if below not in seen:
                     seen.add(below)

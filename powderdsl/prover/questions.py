@@ -15,9 +15,9 @@ from powderdsl.prover.symbolic import LEAVES, Cell, Symbols, Term
 
 @dataclass(frozen=True)
 class Model:
-    """A part of a world that answers a question: what it must hold, and the random numbers that it draws.
+    """A part of a world that answers a question: its content, and the random numbers that it draws.
 
-    Places are relative to the cell that was asked about. `numbers` are rows, columns and steps by (axis, modulus).
+    Places are relative to the cell in question. `numbers` are rows, columns and steps by (axis, modulus).
     """
 
     cells: Mapping[Cell, Mapping[str, bool]]
@@ -26,14 +26,14 @@ class Model:
     numbers: Mapping[tuple[str, int], int]
     has_edges: bool
     floats: tuple[float, ...]
-    """The constants among the floats, and what lies between them."""
+    """The constants among the floats, and the values between them."""
 
 
 GATE = 10
-"""Units of work for making a gate and its clauses."""
+"""Units of work to make a gate and its clauses."""
 
 MAX_ROUNDS = 400
-"""The most times that a question is asked again because equal floats compared differently in its answer."""
+"""Maximum number of times that a question is repeated because its answer compared equal floats differently."""
 
 
 class Questions:
@@ -85,14 +85,14 @@ class Questions:
                 add(clause)
 
     def require(self, literals: Sequence[Literal]) -> None:
-        """Demand from now on that at least one of these holds."""
+        """Require from now on that at least one of these is true."""
         if TRUE not in literals:
             self.solver.add_clause([self._number(literal) for literal in literals if literal != FALSE])
 
     def ask(self, literals: Sequence[Literal], concerned: Sequence[int] | None = None) -> bool:
-        """Return whether all of these can hold at once; then `holds` tells how. Raises OutOfWork.
+        """Return whether all of these can be true at once; `holds` then has their values. Raises OutOfWork.
 
-        `concerned`: the gates that matter, if it is known; all others follow, or can be made to fit.
+        `concerned`: the relevant gates, if known; all others follow from these or are free.
         """
         known = self.symbols.facts
         while self._facts < len(known):
@@ -121,7 +121,7 @@ class Questions:
             budget.left -= self.solver.work - before
 
     def holds(self, literal: Literal) -> bool:
-        """The value of a literal in the model of the last question; variables that it did not concern are false."""
+        """The value of a literal in the model of the last question; variables that were irrelevant to it are false."""
         return self._value(literal >> 1) ^ bool(literal & 1)
 
     def _value(self, gate: int) -> bool:
@@ -131,13 +131,13 @@ class Questions:
             kind, args = self.net.kinds[gate], self.net.args[gate]
             if kind == "choice":
                 self._model[gate] = self.holds(args[1] if self.holds(args[0]) else args[2])
-            else:  # a variable that nothing asked about is false
+            else:  # a variable that no question used is false
                 a, b = map(self.holds, args or (FALSE, FALSE))
                 self._model[gate] = a and b if kind == "and" else a != b
         return self._model[gate]
 
     def model(self, concerned: Sequence[int]) -> Model:
-        """The answer, as far as some gates read it."""
+        """The answer, restricted to what some gates read."""
         cells: dict[Cell, dict[str, bool]] = {}
         numbers: dict[str, dict[Any, int]] = {"draw": {}, "param": {}, "coordinate": {}}
         has_edges = False
@@ -163,14 +163,14 @@ class Questions:
     # Floats
 
     def equal_floats(self, a: Term, b: Term) -> Literal:
-        """Return whether two floats are the same term once all choices are made."""
+        """Return whether two floats are the same term for some choices."""
         if a == b:
             return TRUE
         key = (min(a, b), max(a, b))
         return self.same.setdefault(key, self.symbols.about("same", *key))
 
     def _refine(self, concerned: Sequence[int]) -> bool:
-        """Demand what the model breaks: equal terms are equal, and equal comparisons agree. False if it breaks nothing."""
+        """Add clauses that the model violates (equal terms are equal, equal comparisons agree); False if there is none."""
         terms, broken = self.symbols.terms, False
         resolved: dict[Term, tuple[Term, frozenset[Literal]]] = {}
         gates = set(concerned)
@@ -202,7 +202,7 @@ class Questions:
     def _resolve(
         self, term: Term, resolved: dict[Term, tuple[Term, frozenset[Literal]]]
     ) -> tuple[Term, frozenset[Literal]]:
-        """The term with its choices made as in the model, and the literals that made them."""
+        """The term that results from the model's choices, and the literals of these choices."""
         if term not in resolved:
             terms = self.symbols.terms
             kind, attr, *args = terms.terms[term]

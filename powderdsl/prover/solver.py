@@ -1,6 +1,7 @@
 """A SAT solver in plain Python that learns clauses from conflicts.
 
-Inside, literal v is the code 2 v and -v is 2 v + 1, so `code ^ 1` is the negation. Values are told by what is false.
+Internally, literal v is the code 2 v and -v is 2 v + 1, so `code ^ 1` is the negation. Values are stored as the false
+codes.
 """
 
 from __future__ import annotations
@@ -29,17 +30,17 @@ class Solver:
     def __init__(self) -> None:
         self.work = 0
         self._consistent = True
-        self._model: frozenset[int] = frozenset()  # what is false
+        self._model: frozenset[int] = frozenset()  # the false literals
         # By literal: 1 + the level at which it became false, 0 if it is not; the clause that made it so, () if none did.
         self._falsified: list[int] = []
         self._reasons: list[Sequence[int]] = []
-        # What to look at when a literal becomes false. Of clauses of two literals, the negation of the other; of three,
-        # both others; of more, if it is one of the first two, the clause with the negation of some literal of it.
+        # What to check when a literal becomes false. In clauses of two literals, the negation of the other; of three, both
+        # others; of more, if it is one of the first two, the clause with the negation of one of its literals.
         self._pairs: defaultdict[int, list[int]] = defaultdict(list)
         self._triples: defaultdict[int, list[tuple[int, int]]] = defaultdict(list)
         self._watches: defaultdict[int, list[tuple[int, list[int]]]] = defaultdict(list)
-        # By variable: its score, of which the least is decided first; the score in the heap, inf if it is not there, -inf
-        # if it is never to be decided; the literal that was false last.
+        # By variable: its score (the lowest is decided first); its score in the heap, inf if absent, -inf if it must not be
+        # decided; the literal that was last false.
         self._scores: list[float] = []
         self._queued: list[float] = []
         self._phases: list[int] = []
@@ -48,14 +49,16 @@ class Solver:
         self._weight = 1.0
         self._trail: list[int] = []  # the false literals in order
         self._starts: list[int] = []  # of each level but the first, in the trail
-        self._next = 0  # in the trail, the first whose conclusions are to be drawn
+        self._next = 0  # in the trail, the first literal whose consequences have not been drawn
         self._conflicts = 0
         self._due = KEPT
         self._learned: list[tuple[int, list[int]]] = []  # clauses with the number of their levels
-        self._used: set[int] = set()  # ids of clauses that took part in conflicts since the last were dropped
+        self._used: set[int] = (
+            set()
+        )  # ids of clauses that took part in conflicts since clauses were last dropped
 
     def add_clause(self, literals: Iterable[int]) -> None:
-        """Demands that one of the literals be true; variables are made on demand."""
+        """Require that one of the literals is true; variables are created on demand."""
         codes = dict.fromkeys(map(self._code, literals))
         clause = [code for code in codes if not self._falsified[code]]
         if any(self._falsified[code ^ 1] or code ^ 1 in codes for code in clause):
@@ -71,11 +74,11 @@ class Solver:
     ) -> bool:
         """Return whether all clauses and assumptions can be true.
 
-        With `decide`, only these variables are decided, and if they have values without a conflict, the answer is yes:
-        right if the clauses of all others define them, as those of gates do.
+        With `decide`, only these variables are decided, and the answer is yes if they have values without a conflict.
+        This is correct if clauses define all other variables, as those of gates do.
 
         Raises:
-            OutOfWork: `work` has passed `limit`; what was learned is kept, and the solver can be asked again.
+            OutOfWork: `work` has passed `limit`; learned clauses are kept, so `solve` can be called again.
         """
         assumed = [self._code(literal) for literal in assumptions]
         for variable in self._choice:
@@ -95,7 +98,7 @@ class Solver:
             self._undo(0)
 
     def holds(self, literal: int) -> bool:
-        """Return whether a literal is true in the last model that `solve` found, where variables without value are False."""
+        """Return whether a literal is true in the last model that `solve` found; variables without a value are False."""
         return (2 * abs(literal) + 1 in self._model) == (literal > 0)
 
     def _code(self, literal: int) -> int:
@@ -103,7 +106,7 @@ class Solver:
             raise ValueError("a literal is v or -v, never 0")
         code = 2 * literal if literal > 0 else 1 - 2 * literal
         if code >= len(self._falsified):
-            old, size = len(self._scores), code + 1  # twice what is needed
+            old, size = len(self._scores), code + 1  # twice the required size
             self._scores += [0.0] * (size - old)
             self._queued += [-inf] * (size - old)
             self._phases += range(2 * old, 2 * size, 2)
@@ -119,7 +122,7 @@ class Solver:
             for place, code in enumerate(clause):
                 self._triples[code].append((clause[place - 1], clause[place - 2]))
         else:
-            lists = [self._watches[code] for code in clause]  # made here: each may watch later
+            lists = [self._watches[code] for code in clause]  # created here: each may be watched later
             for watching in lists[:2]:
                 watching.append((clause[2] ^ 1, clause))
 
@@ -139,7 +142,7 @@ class Solver:
                 self._learn(conflict)
             elif self._conflicts >= stop:
                 run, factor = (run + 1, 1) if run & -run == factor else (run, 2 * factor)
-                stop = self._conflicts + RUN * min(factor, 64)  # or scores might overflow
+                stop = self._conflicts + RUN * min(factor, 64)  # prevents overflow of scores
                 self._undo(0)
             elif self._conflicts >= self._due and not starts:
                 self._drop()
@@ -176,12 +179,12 @@ class Solver:
             del self._trail[self._next :]
 
     def _propagate(self) -> Sequence[int]:
-        """Draws all conclusions; a clause that became false, or () if none did."""
+        """Draws all consequences; returns a clause that became false, or () if none did."""
         falsified, reasons, watches = self._falsified, self._reasons, self._watches
         level = len(self._starts) + 1
         queue = self._trail[self._next :]
         conflict: Sequence[int] = ()
-        for false in queue:  # which grows
+        for false in queue:  # the trail grows during the loop
             pairs = self._pairs.get(false, ())
             triples = self._triples.get(false, ())
             watching = watches.get(false, ())
@@ -238,9 +241,9 @@ class Solver:
         return conflict
 
     def _learn(self, conflict: Sequence[int]) -> None:
-        """Learns a clause from a conflict, and goes back to the level where it draws a conclusion.
+        """Learns a clause from a conflict, and returns to the level where the clause has a consequence.
 
-        It has one literal of the conflict's level: the last through which all ways from the decision went.
+        It has one literal of the conflict's level: the last one through which all paths from the decision led.
         """
         falsified, reasons, trail = self._falsified, self._reasons, self._trail
         current = len(self._starts) + 1
@@ -271,7 +274,7 @@ class Solver:
             if falsified[code] < current and (
                 not causes or any(falsified[cause] > 1 and cause not in seen for cause in causes)
             ):
-                clause.append(code)  # it does not follow from others
+                clause.append(code)  # it does not follow from the others
         levels = len({falsified[code] for code in clause})
         if len(clause) > 1:
             self._attach(clause)
@@ -281,7 +284,7 @@ class Solver:
         self._falsify(clause[0] ^ 1, clause)
 
     def _drop(self) -> None:
-        """Forgets the worse half of the learned clauses: not used of late, over many levels, long."""
+        """Drops the worse half of the learned clauses: those not used recently, with many levels, and long."""
         self._learned.sort(key=lambda pair: (id(pair[1]) not in self._used, pair[0], len(pair[1])))
         half = len(self._learned) // 2
         worse = {id(clause) for _, clause in self._learned[half:]}

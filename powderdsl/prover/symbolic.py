@@ -1,7 +1,7 @@
-"""Worlds as formulas: what a cell holds after some passes, as gates over what cells around it held before.
+"""Worlds as formulas: the content of a cell after some passes, as gates over the content of cells around it before.
 
-Bits are literals of a net. Floats are terms that are not interpreted: equal operations on equal terms are equal, and
-little more. The grid is the infinite plane: a world that wraps is a plane that repeats, so what holds for all planes holds
+Bits are literals of a net. Floats are uninterpreted terms: equal operations on equal terms are equal, and little
+more. The grid is the infinite plane: a world that wraps is a plane that repeats, so what holds for all planes holds
 for all worlds.
 """
 
@@ -31,11 +31,11 @@ Term = int
 Cell = tuple[int, int]
 
 MAX_SIZE = 1_500_000
-"""Gates and terms of one question."""
+"""Maximum number of gates and terms of one question."""
 
 
 WORK_PER_SECOND = 1_000_000
-"""Units of work that a slow machine does in a second: clauses and literals that the solver visits, and a tenth of a gate."""
+"""Units of work per second on a slow machine: clauses and literals that the solver visits, and tenths of gates."""
 
 
 class Undecided(Exception):
@@ -44,7 +44,7 @@ class Undecided(Exception):
 
 @dataclass
 class Budget:
-    """The work that is left, counted so that it ends at the same place on every machine."""
+    """The remaining work, counted so that it ends at the same point on every machine."""
 
     left: int
 
@@ -54,7 +54,7 @@ class Budget:
         return cls(int(seconds * WORK_PER_SECOND))
 
     def spend(self, work: int) -> None:
-        """Raises OutOfWork if there is not enough left."""
+        """Raise OutOfWork if not enough is left."""
         self.left -= work
         if self.left < 0:
             raise OutOfWork
@@ -84,7 +84,7 @@ class Terms:
         return value if kind == "const" else None  # type: ignore[return-value]
 
     def choices(self, term: Term) -> frozenset[int]:
-        """The gates that decide which of its parts a term is."""
+        """The gates that decide which of its parts a term equals."""
         if term not in self._choices:
             kind, attr, *args = self.terms[term]
             parts: list[Any] = args if kind in OPS and kind not in LEAVES else []
@@ -122,7 +122,7 @@ class Terms:
 
 
 class World(Protocol):
-    """A world, known as formulas."""
+    """A world, given by formulas."""
 
     def bit(self, plane: str, y: int, x: int) -> Literal: ...
     def real(self, slot: str, y: int, x: int) -> Term: ...
@@ -130,7 +130,7 @@ class World(Protocol):
 
 @dataclass(frozen=True)
 class Layout:
-    """A slot of whole numbers: its bit planes, and which values are well-formed."""
+    """A slot of integers: its bit planes, and its well-formed values."""
 
     slot: Slot
     planes: tuple[str, ...]
@@ -138,16 +138,16 @@ class Layout:
     lo: int
     hi: int
     usual: tuple[int | None, ...]
-    """By id: the value in fresh cells, None where a parameter decides."""
+    """By id: the value in fresh cells; None if a parameter decides."""
     holders: frozenset[int] | None
-    """Elements whose cells may hold other values than the usual one; None for all."""
+    """Elements whose cells may have unusual values; None for all."""
 
     def bits(self, world: World, y: int, x: int) -> list[Literal]:
         return [world.bit(plane, y, x) for plane in self.planes]
 
 
 def layouts(ruleset: Ruleset, program: Program) -> dict[str, Layout]:
-    """The slots of flags and whole numbers by name, that of elements first."""
+    """The slots of flags and integers by name, that of elements first."""
     types = {slot.name: slot.type for slot in program.slots}
     rows = {}
     for slot in slots(ruleset):
@@ -166,9 +166,9 @@ def layouts(ruleset: Ruleset, program: Program) -> dict[str, Layout]:
 
 
 class Symbols:
-    """The variables of one question: bits of cells, draws, parameters and places; `facts` are literals that hold.
+    """The variables of one question: bits of cells, draws, parameters and places; `facts` are true literals.
 
-    `program` is the one whose passes are looked at: its streams, parameters and slots are the ruleset's.
+    `program` has the passes to examine, and the streams, parameters and slots of the ruleset.
     """
 
     def __init__(
@@ -180,20 +180,20 @@ class Symbols:
         shared: dict[str, Layout] | None = None,
     ) -> None:
         self.ruleset, self.budget = ruleset, budget
-        budget.spend(0)  # nothing is made if nothing is left
+        budget.spend(0)  # create nothing if no work is left
         self.net = Net()
         self.terms = Terms()
         self.layouts = shared or layouts(ruleset, program)
         self.ids = [element.id for element in ruleset.elements]
         self.facts: list[Literal] = []
         self.general: list[Literal] = []
-        """Those of them that concern parameters and the numbers of rows, columns and steps."""
+        """Facts about parameters and about the numbers of rows, columns and steps."""
         self.comparisons: dict[tuple[str, Term, Term], Literal] = {}
         self.draws: dict[str, int] = {}
         """The streams that were read, with the bits of their draws."""
         self.limit = limit
         self.turn: Callable[[Cell], Cell] | None = None
-        """The map from cells of a turned world to those of the other one, while a turned world is evaluated."""
+        """While a turned world is evaluated: the map from its cells to those of the other one."""
         self._owners = {plane: row for row in self.layouts.values() for plane in row.planes}
         self._known: set[object] = set()
 
@@ -234,9 +234,9 @@ class Symbols:
     def coordinate(self, axis: str, modulus: int, bit: int, y: int, x: int) -> Literal:
         """A bit of a row's, a column's or a step's number, modulo something."""
         if self.turn and axis != "step":
-            raise Undecided("numbers of rows and columns in turned worlds")
+            raise Undecided("numbers of rows and columns in rotated or mirrored worlds")
         net, at = self.net, {"row": y, "column": x}.get(axis, 0)
-        # Where sides are no multiple of the modulus, numbers begin again at an edge: each row may then have any.
+        # Where sides are not a multiple of the modulus, numbers restart at an edge: each row may then have any.
         repeats = axis == "step" or self.ruleset.side_multiple % modulus == 0
         key = (axis, modulus) if repeats else (axis, modulus, at)
         bits = [net.variable("coordinate", *key, i) for i in range(max((modulus - 1).bit_length(), 1))]
@@ -252,7 +252,7 @@ class Symbols:
             at, offset = self.turn(at), self.turn(offset)
         parts = zip(("row", "column"), at, offset, strict=True)
         near = ((axis, a, e) for axis, a, d in parts for e in range(d, 0, -1 if d > 0 else 1))
-        return self.net.all(self.net.variable("outside", *name) ^ 1 for name in near)  # with all behind it
+        return self.net.all(self.net.variable("outside", *name) ^ 1 for name in near)  # those between too
 
     def compare(self, op: str, a: Term, b: Term) -> Literal:
         """A comparison of floats: a variable, decided only for constants."""
@@ -263,7 +263,7 @@ class Symbols:
         return self.comparisons.setdefault(key, self.about("comparison", *key))
 
     def about(self, *name: Any) -> Literal:
-        """A variable about two floats, the end of its name: what they are depends on the gates that choose their parts."""
+        """A variable about two floats, named by their terms: these depend on the gates that choose their parts."""
         literal = self.net.variable(*name)
         self.net.inputs[literal >> 1] = (*frozenset().union(*map(self.terms.choices, name[-2:])),)
         return literal
@@ -281,8 +281,8 @@ class Symbols:
     def well_formed(
         self, world: World, cell: Cell, planes: Iterable[str] | None = None, ranges: Ranges | None = None
     ) -> list[Literal]:
-        """Return what every cell fulfills, as far as it concerns these planes: known elements, numbers in their ranges, and
-        usual values in cells of elements that hold no others. `ranges` are narrower ones."""
+        """Return the facts about every cell in these planes: known elements, numbers in their ranges, and usual
+        values in cells whose elements can have no others. `ranges` are narrower ranges."""
         net, element = self.net, self.layouts["element"]
         owned = self._owners if planes is None else filter(self._owners.__contains__, planes)
         owners = dict.fromkeys(map(self._owners.__getitem__, owned))
@@ -372,12 +372,12 @@ class Turned:
         return net.choice(net.member(element, row.holders), turned, bit)  # the usual value does not turn
 
     def real(self, slot: str, y: int, x: int) -> Term:
-        raise Undecided("floats in turned worlds")
+        raise Undecided("floats in rotated or mirrored worlds")
 
 
 @dataclass(frozen=True)
 class Written:
-    """A world some of whose planes are nodes, which `value` evaluates; the others are those of a world before."""
+    """A world with some planes given by nodes, which `value` evaluates; the other planes are those of a world before."""
 
     before: World
     writes: Mapping[str, Node]
@@ -394,7 +394,7 @@ class Written:
 
 @dataclass(frozen=True)
 class Names:
-    """The names by which another ruleset is read: of its parameters and its streams. `fixed` are values of parameters."""
+    """The names of another ruleset's parameters and streams. `fixed` has values of parameters."""
 
     params: Mapping[str, str] = field(default_factory=dict)
     streams: Mapping[str, str] = field(default_factory=dict)
@@ -405,7 +405,8 @@ class Names:
 
 
 class Evaluation:
-    """Nodes as formulas over a world before. Nodes of `cut` may have any value, in the plane of the world that it names."""
+    """Nodes as formulas over an earlier world. Nodes of `cut` may have any value, in the plane of the world that it
+    names."""
 
     def __init__(self, before: World, symbols: Symbols, names: Names | None = None) -> None:
         self.before, self.symbols, self.names = before, symbols, names or Names()
@@ -513,7 +514,7 @@ class Evaluation:
 
 @contextmanager
 def deep_recursion() -> Iterator[None]:
-    """Room for formulas as deep as the gates of a pass: Python's own calls need no stack of the machine's."""
+    """A stack deep enough for formulas as deep as a pass's gates: calls in Python do not use the machine's stack."""
     before = sys.getrecursionlimit()
     sys.setrecursionlimit(10 * MAX_SIZE)
     try:

@@ -25,10 +25,10 @@ class Judgment:
 def judgments(
     ruleset: Ruleset, claims: Sequence[tuple[Claim, frozenset[int]]], seconds: float
 ) -> list[Judgment]:
-    """Judge claims about worlds that start without some elements, one after the other.
+    """Judge claims about worlds that start without some elements, in order.
 
-    `seconds` bounds the work for all of them: it is counted, so results are the same on every machine. Sums, which take most
-    work, come last, and no claim gets more than an eighth.
+    `seconds` bounds the work for all of them, which is counted, so results are the same on every machine. Sums, which
+    take the most work, come last, and no claim gets more than an eighth.
     """
     try:
         with deep_recursion():
@@ -47,7 +47,7 @@ def judgments(
                 prover.budget.left = max(prover.budget.left, 0) + rest
             return [results[number] for number in range(len(claims))]
     except NotBits as error:
-        return [Judgment(False, f"bit planes cannot carry the rules: {error}")] * len(claims)
+        return [Judgment(False, f"bit planes cannot express the rules: {error}")] * len(claims)
     except (OutOfWork, Undecided):
         return [Judgment(False, "the rules are too large for a proof")] * len(claims)
 

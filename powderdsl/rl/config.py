@@ -17,12 +17,12 @@ if TYPE_CHECKING:
 
 OBSERVATIONS = ("compact", "ids", "matrix", "laws")
 USUAL_OBSERVATION = MappingProxyType({"paper": "compact", "small": "ids", "fcn": "ids"})
-"""The networks, and the default observation of each."""
+"""The networks, with the default observation of each."""
 
 POLICIES = ("trained", "expert", "random", "nothing")
-"""Policies to compare. Only runs have a trained one, and only some tasks an expert."""
+"""Policies to compare. `trained` needs a run; `expert` needs a task that has one."""
 BASELINES = ("random", "nothing")
-"""Baselines, which others are compared with in the same worlds."""
+"""Baselines, with which other policies are compared in the same worlds."""
 
 
 @dataclass(frozen=True)
@@ -99,7 +99,7 @@ class TrainConfig:
         option="checkpoint-every",
         may_change=True,
     )
-    """The work that a kill may cost."""
+    """The work that may be lost if the process is killed."""
     eval_every: int = setting(
         0, "Interactions between evaluations on held-out worlds; 0: none.", 0, 10**12, may_change=True
     )
@@ -115,12 +115,12 @@ class TrainConfig:
         """The settings that determine the result: all except those of HOW, plus `steps` with a linear schedule."""
         settings = {name: value for name, value in self.as_json().items() if name not in HOW}
         if self.precision == "float32":
-            del settings["precision"]  # older runs have none
+            del settings["precision"]  # missing in older runs
         return settings if self.schedule == "constant" else {**settings, "steps": self.steps}
 
 
 HOW = tuple(field.name for field in fields(TrainConfig) if field.metadata.get("may_change"))
-"""Settings that may change when a run is resumed, which do not affect what it trains."""
+"""Settings that may change when a run is resumed, because they do not affect the result."""
 
 PRESETS: Mapping[str, Mapping[str, Any]] = MappingProxyType(
     {

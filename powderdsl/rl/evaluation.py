@@ -366,7 +366,7 @@ def film(
     seed: int = 0,
     factor: int = 4,
 ) -> tuple[Played, Iterator[NDArray[np.uint8]]]:
-    """Play worlds, int64 [n], as `rl.evaluation.play` does; the results, and the pictures, uint8 [H', W', 3].
+    """Play worlds, int64 [n], as `rl.evaluation.play` does; return the results and the pictures, uint8 [H', W', 3].
 
     There is a picture of the start, and one after each action and each step, free steps included. Worlds whose
     episode is over no longer change.

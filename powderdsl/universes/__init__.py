@@ -1,8 +1,7 @@
-"""Generated universes: rule packs with invented elements and laws, made from a seed and the pieces in
-`rules/universes/`.
+"""Generated universes: rule packs with invented elements and laws, made from a seed and `rules/universes/`.
 
-The same seed gives the same text, on every machine. Packs are correct by construction: no reaction increases the rank,
-so that nothing grows forever, and the pack claims the consequences.
+The same seed gives the same text on every machine. Packs are correct by construction: no reaction increases the rank,
+so nothing grows forever, and the pack claims the consequences.
 """
 
 from __future__ import annotations

@@ -1,4 +1,5 @@
-"""A seed -> the text of a universe, made from the pieces in `rules/universes/laws.yaml`, which explains their form."""
+"""Generates the text of a universe from a seed and the pieces in `rules/universes/laws.yaml`, which explains their
+form."""
 
 from __future__ import annotations
 
@@ -18,7 +19,7 @@ from powderdsl.system.random import MASK, START_0, mix
 T = TypeVar("T")
 Pieces = Mapping[str, Any]
 Phrase = tuple[str, str]
-"""The word for rules, and the word for people."""
+"""The word in rules, and the word in descriptions."""
 
 MAX_SEED = 0xFFFFFFFF
 PLACE = re.compile(r"<(\w+)(?: (\w+))?>")
@@ -82,15 +83,15 @@ class Universe:
     names: dict[str, str] = field(default_factory=dict)
     """The names of elements, by part."""
     tags: dict[str, str] = field(default_factory=dict)
-    """The tags of elements that no other has, by part."""
+    """The tags of elements, by part; no two elements share one."""
     levels: dict[str, int] = field(default_factory=dict)
-    """The ranks of parts; reactions never turn a part into a higher one."""
+    """The ranks of parts; reactions never turn a part into one of higher rank."""
     params: list[str] = field(default_factory=list)
     passes: dict[str, list[str]] = field(default_factory=dict)
     sentences: list[str] = field(default_factory=list)
 
     def law(self, law: Pieces, name: str, given: Mapping[str, str] | None = None) -> None:
-        """Add a law if it applies to something. `given`: the parts of some letters."""
+        """Add a law if some parts fit it. `given`: the parts of some letters."""
         chosen = dict(given or {})
         for letter, choice in law.get("draws", {}).items():
             if not (parts := [*self.candidates(choice, chosen)]):
@@ -110,7 +111,7 @@ class Universe:
             self.passes[name] = self.block("pass", name=name, about=self.sentences[-1], body=body)
 
     def candidates(self, choice: str, chosen: Mapping[str, str]) -> Iterable[str]:
-        """The parts of a group, or those below, above or level with the part of a letter."""
+        """The parts of a group, or those with a lower, higher or equal rank than the part of a letter."""
         group, _, letter = choice.partition(" ")
         parts: list[str] = self.pieces["groups"][group]
         if letter:
@@ -139,11 +140,11 @@ class Words:
     universe: Universe
     name: str
     own: Mapping[str, str]
-    """The chances with their own names, and the number of the law; others are named after the law."""
+    """The named chances and numbers of the law; other chances are named after the law."""
     known: dict[str, Phrase] = field(default_factory=dict)
 
     def filled(self, text: str, form: int = 1) -> str:
-        """A text with its placeholders filled in, for rules (0) or people (1)."""
+        """A text with its placeholders filled in, for rules (0) or descriptions (1)."""
         return PLACE.sub(lambda match: self.phrase(match[1], match[2])[form], text)
 
     def phrase(self, word: str, letter: str | None) -> Phrase:

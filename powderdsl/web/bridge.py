@@ -32,23 +32,23 @@ from powderdsl.worlds.strewn import frame_element
 
 MAX_FILES = 64
 MAX_TEXT = 1 << 20
-"""Characters of all files together."""
+"""Maximum number of characters of all files together."""
 
 NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_-]{0,60}\.ya?ml")
 PACK = re.compile(r"[A-Za-z_][A-Za-z0-9_]{0,60}")
 
 
 PROOF = 10.0
-"""Seconds of work for proofs, counted: a third of the time that the page waits."""
+"""Seconds of counted work for proofs: a third of the time that the page waits."""
 
 
 class BadRequest(ValueError):
-    """The page, or a link to it, requests something that the session cannot do."""
+    """Raised if the page, or a link to it, requests something that the session cannot do."""
 
 
 @dataclass(frozen=True)
 class Selection:
-    """Rule files by name; `words`, the files that `load` gets; and `off`, the packs that are left out."""
+    """Rule files by name; `words`, the names passed to `load`; and `off`, the packs to leave out."""
 
     files: Mapping[str, str]
     words: list[str]
@@ -61,7 +61,7 @@ class Session:
     def __init__(self, folder: Path):
         self.folder = folder
         self.memo = Memo(versions=2, things=250)
-        """Enough for one ruleset of 60 passes: a page has less memory than a machine."""
+        """Enough for one ruleset of 60 passes: a page has little memory."""
         self.ruleset: Ruleset | None = None
         self.good = Selection({}, [], [])
         """The files of these rules."""
@@ -72,7 +72,7 @@ class Session:
     def check(self, files: Mapping[str, str], off: list[str]) -> dict[str, Any]:
         """Load the files without the packs in `off`. If they have mistakes, the previous rules stay.
 
-        Diagnostics have the text that `check` prints. `texts` are loaded packs that ship and are not among the files.
+        Diagnostics have the text that `check` prints. `texts` are loaded shipped packs that are not among the files.
         """
         selection = self._write(files, off)
         names = [str(self.folder / word) for word in selection.words]
@@ -92,17 +92,17 @@ class Session:
         return answer | {"diagnostics": data, "packs": list(packs), "texts": texts, "words": words}
 
     def complete(self, text: str, offset: int) -> list[dict[str, str]]:
-        """The words that fit at a place of a file, as the language server offers them."""
+        """The words that are allowed at a place of a file, as the language server offers them."""
         beside = [pack.name.text for pack in self.known.packs]
         return [vars(item) for item in completions(text, offset, self.known, beside)]
 
     def explain(self, text: str, offset: int) -> str:
-        """What the word at a place of a file means, as Markdown."""
+        """The meaning of the word at a place of a file, as Markdown."""
         found = explanation(Source("", text), offset, self.known)
         return found[0] if found else ""
 
     def format(self, text: str) -> str:
-        """A file in the one layout; unchanged if it cannot be read."""
+        """A file in the standard layout; unchanged if it cannot be read."""
         return formatted(Source("", text), Reporter()) or text
 
     def _write(self, files: Mapping[str, str], off: list[str]) -> Selection:
@@ -146,7 +146,7 @@ class Session:
         return self.ruleset
 
     def universe(self, seed: str) -> dict[str, Any]:
-        """The rules of `powderdsl universe SEED`, as the site has its own rules."""
+        """The rules of `powderdsl universe SEED`, in the form of the site's own rules."""
         name = f"{PREFIX}{seed}"
         ruleset, sources = load(name), [pack.source for pack in read([name], Reporter())[0]]
         files = {f"{Path(source.name).stem.replace(':', '_')}.yaml": source.text for source in sources}
@@ -162,8 +162,8 @@ class Session:
     def command(self) -> dict[str, Any]:
         """The arguments of the command line for the last good rules: `rules` for `run`, and `files` to save first.
 
-        Files that differ from the shipped ones must be saved. If a member of a ruleset is saved, the ruleset is too,
-        since members are looked up in its folder.
+        Files that differ from the shipped ones must be saved. If a member of a ruleset is saved, the ruleset must be
+        saved too, since members are looked up in its folder.
         """
         words, off = self.good.words, self.good.off
         own = set()
@@ -197,7 +197,8 @@ class Session:
         return ledger_text(ledger(self._rules()))
 
     def invariants(self) -> list[dict[str, Any]]:
-        """The invariants: `proven` with how and why, `tried` on worlds, or `broken` with a small counterexample."""
+        """The invariants: `proven` with the method and reason, `tried` on worlds, or `broken` with a small
+        counterexample."""
         from powderdsl.testing.properties.outcomes import counterexample_lines
         from powderdsl.testing.properties.search import quick_results
 
@@ -215,7 +216,7 @@ class Session:
         return rows
 
     def tests(self, pack: str) -> list[dict[str, Any]]:
-        """The tests of a pack: the place of each, its worlds, and the problem and the world then if it failed."""
+        """The tests of a pack: the place and worlds of each, and for failed ones the problem and the resulting world."""
         from powderdsl.testing.pack_tests.runner import run_examples
 
         rules = self._rules()
@@ -236,7 +237,7 @@ class Session:
         ]
 
     def trace(self, world: dict[str, Any], row: int, column: int, params: dict[str, float]) -> dict[str, Any]:
-        """The trace of a cell in the next step of a world, as text and as data; `params` have other values."""
+        """The trace of a cell in the next step of a world, as text and as data, with some values of `params` replaced."""
         from powderdsl.simulation.simulator import Simulator
         from powderdsl.simulation.tracing import trace, trace_data, trace_text
 

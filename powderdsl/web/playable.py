@@ -1,4 +1,4 @@
-"""The tasks that people play in the page, as data: start worlds, the agent's limits, and the goal as arithmetic on counts."""
+"""The tasks for people in the page, as data: start worlds, the agent's limits, and the goal as arithmetic on counts."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ from powderdsl.tasks.tensors.generator import StartWorlds
 from powderdsl.worlds.store import world_data
 
 WORLDS = 8
-"""Start worlds of a task that the page has: the first ones of its first split."""
+"""Number of start worlds of a task in the page: the first ones of its first split."""
 
 _KNOWN = {"element", "member", "let", "and", "or", "not", "const"}
-"""Operations of cells whose element is all that matters."""
+"""Operations on cells that depend only on their element."""
 
 
 @cache
@@ -49,7 +49,7 @@ def _measures(task: Task) -> list[Measure]:
 
 
 def task_data(name: str) -> dict[str, Any]:
-    """A task as the page plays it: expressions are lists of an operation and its arguments."""
+    """A task for the page: expressions are lists of an operation and its arguments."""
     task, rules = load_task(name), load_task(name).ruleset
     made = StartWorlds(task, task.splits[0].name, ArrayKind()).make(np.arange(WORLDS, dtype=np.int64))
     agent, measures = task.agent, _measures(task)
@@ -88,7 +88,7 @@ def task_data(name: str) -> dict[str, Any]:
 
 
 def _counted(measure: Measure, elements: list[int]) -> dict[str, Any]:
-    """What a measure counts in `region`: elements `inside` the region `let`, which its cells name, and outside it."""
+    """The cells that a measure counts in `region`: elements `inside` the region `let` named by its cells, and outside."""
     value = measure.value
     assert value is not None
     lets = [str(part.value).removeprefix(REGION_LET) for part in value.walk() if part.op == "let"]
@@ -98,7 +98,7 @@ def _counted(measure: Measure, elements: list[int]) -> dict[str, Any]:
 
 
 def _holds(cell: Expr, element: int, inside: bool) -> Any:
-    """The value of an expression in a cell of an element, in or outside the region that it names."""
+    """The value of an expression in a cell of an element, inside or outside the region that it names."""
     args = [_holds(arg, element, inside) for arg in cell.args]
     leaves = {"element": element, "let": inside, "const": cell.value}
     if cell.op in leaves:

@@ -1,6 +1,6 @@
 """The playground as files: the page, rules as WebAssembly modules, start worlds, and the compiler for Pyodide.
 
-The server listens on loopback: only GET, only files of the site, only for pages of this server.
+The server listens on loopback and answers only GET requests for files of the site, from pages of this server.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ PARTS = HERE / "parts"
 """Pyodide and CodeMirror, with their licenses, which `make web` fetches from npm. Git ignores the folder."""
 
 MADE = HERE / "made"
-"""Files about shipped rules, which `make wheel` compiles, so that the page of an installed wheel opens at once."""
+"""Files about shipped rules, which `make wheel` compiles, so that the page of an installed wheel opens without delay."""
 
 ADDRESS = "127.0.0.1"
 TYPES = {
@@ -125,7 +125,7 @@ class Entry:
 
 
 def shipped_entries() -> list[Entry]:
-    """The shipped rules that load alone, except variants, then each example pack added to the first rules.
+    """The shipped rules that load alone, except variants, followed by each example pack added to the first rules.
 
     Rules that most tasks use come first, then rules with the most elements.
     """
@@ -224,9 +224,9 @@ def _picture(sheet: Mapping[str, Any], ruleset: Ruleset) -> bytes:
 
 
 class Site:
-    """All files of the page, made on request.
+    """All files of the page, created on request. `first`: the rules that the page opens with.
 
-    `first`: the rules that the page opens with. `offline`: for a host elsewhere, where a service worker keeps the files.
+    `offline`: for another host, where a service worker stores the files.
     """
 
     def __init__(self, first: Entry | None = None, *, offline: bool = False):
@@ -266,7 +266,7 @@ class Site:
         return makers
 
     def _landing(self, text: str) -> bytes:
-        """The first page of a site elsewhere, with a card for each of the rules."""
+        """The first page of an exported site, with a card for each of the rules."""
         cards = [
             f'<a class="card" href="play.html?rules={row["key"]}"><img src="rules/{row["key"]}.png" alt="" loading="lazy">'
             f"<strong>{row['key']}</strong><small>{html.escape(row['about'])}</small></a>"
@@ -275,7 +275,7 @@ class Site:
         return text.replace("<!-- cards -->", "\n".join(cards)).encode()
 
     def _worker(self, text: str) -> bytes:
-        """The service worker. It keeps the files of a visit, and those about other rules once they are opened."""
+        """The service worker. It stores the files of a visit, and those about other rules once they are opened."""
         first = {self.start, f"rules/{self.rows[0]['key']}.json"}
         lazy = re.compile(r"rules/|tasks/|parts/licenses/|licenses\.txt|sw\.js")
         kept = [name for name in self.files if name in first or not lazy.match(name)]
@@ -295,10 +295,8 @@ class Site:
         return None if make is None else make()
 
     def write(self, folder: Path) -> int:
-        """Write all files, compressed ones beside them, and return their number.
-
-        Raises CompileError (PD613) if a file cannot be written.
-        """
+        """Write all files, with compressed ones next to them, and return their number. Raises CompileError (PD613) on
+        failure."""
         count = 0
         for name, make in self.files.items():
             data = make()
@@ -310,7 +308,7 @@ class Site:
 
 
 class SiteServer(ThreadingHTTPServer):
-    """Serves one site, with a thread for each request, since some files take long to make."""
+    """Serves one site, with a thread for each request, since some files take long to create."""
 
     daemon_threads = True
 
@@ -330,7 +328,7 @@ class _Handler(BaseHTTPRequestHandler):
     def do_GET(self) -> None:
         own = {f"{name}:{self.server.server_port}" for name in (ADDRESS, "localhost")}
         origin = self.headers.get("Origin")
-        # A page elsewhere can neither name this server (Host) nor read it from its own origin (Origin).
+        # A page of another site can neither name this server (Host) nor read it from its own origin (Origin).
         is_ours = not origin or origin in {f"http://{host}" for host in own}
         if self.headers.get("Host") not in own or not is_ours:
             self._answer(HTTPStatus.FORBIDDEN, b"this server answers its own page only", "txt")
@@ -383,7 +381,7 @@ def _write(path: Path, data: bytes) -> None:
 
 
 def pack(name: str, data: bytes) -> bytes:
-    """A file compressed by gzip, or as it is if that gains nothing."""
+    """A file compressed by gzip, or unmodified if that saves nothing."""
     packed = gzip.compress(data, mtime=0) if name.rpartition(".")[2] in PACKED else data
     return packed if len(packed) < len(data) else data
 
@@ -398,7 +396,7 @@ def _dump(value: Any) -> bytes:
 
 
 def cached(name: str, make: Make) -> bytes:
-    """A file about shipped rules: from the installation, or made once for a version of the code."""
+    """A file about shipped rules: from the installation, or created once for a version of the code."""
     version, path = MADE / "version.txt", MADE / name
     if version.is_file() and version.read_text(encoding="utf-8") == code_version() and path.is_file():
         return path.read_bytes()
@@ -455,7 +453,8 @@ ABSENT = (
     "web/playable.py",
     "web/site.py",
 )
-"""Parts of powderdsl that `web/bridge.py` does not import: the command line, what requires torch, and the page itself."""
+"""Parts of powderdsl that `web/bridge.py` does not import: the command line, modules that require torch, and the page
+itself."""
 
 
 @cache
@@ -497,11 +496,10 @@ OWN_SHAPES = 12
 
 
 def offered_worlds(ruleset: Ruleset, names: Sequence[str]) -> tuple[list[dict[str, Any]], str]:
-    """The worlds that the page offers with some rules, and the name of the one that shows the rules best.
+    """The worlds that the page offers with some rules, and the name of the world that shows them best.
 
-    A world has `name`, `about` and the keys of `world_data`.
-
-    `names` are the arguments of `load`: an added pack gets a world with its elements.
+    A world has `name`, `about` and the keys of `world_data`. `names` are the arguments of `load`: an added pack gets
+    a world with its elements.
     """
     worlds = []
     for scene in shipped_scenes():

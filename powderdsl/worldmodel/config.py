@@ -85,7 +85,7 @@ class TrainConfig(Checked):
 
     @property
     def plain(self) -> dict[str, Any]:
-        """The settings in use, as in ``run.json``."""
+        """The values of all settings, as in ``run.json``."""
         return {name: value for name, value in asdict(self).items() if value is not None}
 
     @staticmethod

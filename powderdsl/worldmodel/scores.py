@@ -102,7 +102,7 @@ class Score:
         return _share(int(gaps), UNITS * int(table[:, 0].sum()))
 
     def reliability(self) -> dict[str, list[dict[str, float | int]]]:
-        """For each of `KINDS` the bins that have cells: their bounds, cells, mean probability, and share that was right."""
+        """The bins with cells, for each of `KINDS`: bounds, cells, mean probability, and share of correct cells."""
         return {
             kind: [
                 {

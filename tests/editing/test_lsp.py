@@ -198,7 +198,7 @@ def test_words_are_explained_found_and_renamed(folder: Path) -> None:
         assert "goo swaps below" in "\n".join(text)
 
         for behind, name, why in (
-            ("- go", "empty", "is a name already"),
+            ("- go", "empty", "is already a name"),
             ("- go", "count", "cannot be a name"),
             ("- go", "2nd", "cannot be a name"),
             ("below is em", "nil", "comes with powderdsl"),

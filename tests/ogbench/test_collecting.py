@@ -115,7 +115,7 @@ def test_other_data_are_not_overwritten(data: Path, short: LevelProgram) -> None
     other = data / "strange"
     other.mkdir()
     (other / f"{NAME}.npz").write_bytes(b"mine")
-    with pytest.raises(ValueError, match="is there already"):
+    with pytest.raises(ValueError, match="exists, but"):
         collect(short, other, episodes=5)
 
 

@@ -136,7 +136,7 @@ def test_bounds_of_fields() -> None:
     book = ledger(
         small("  tick: {do: [age := 3 where mud, age += 1 where grass]}\n  tock: {do: age := 0 where air}\n")
     )
-    assert book.within("age", 0, 9) == Proven("`age` is declared as 0..9, and every write is cut off there")
+    assert book.within("age", 0, 9) == Proven("`age` is declared as 0..9, and every write is clamped to it")
     verdict = book.within("age", 0, 5)
     assert isinstance(verdict, NotProven)
     assert [line.text for line in verdict.rules] == ["age += 1"]

@@ -91,11 +91,11 @@ def command(
     """
     for name, value in ({"replay": replay, "picture": picture} if mutate else mutation).items():
         if value:
-            raise BadInput(f"--{name} goes {'without' if mutate else 'with'} --mutate")
+            raise BadInput(f"--{name} {'cannot be used with' if mutate else 'requires'} --mutate")
     if mutate:
         return _mutate(rules or shipped_tests(), as_json, settings=settings, seed=seed, **mutation)
     if replay is not None and len(rules) != 1:
-        raise BadInput("--replay takes the one RULES that the counterexample breaks")
+        raise BadInput("--replay needs exactly one RULES argument: the rules of the counterexample")
     if keep is None:
         keep = not os.environ.get("CI")  # a disposable CI machine
     session = _Report(backend, SearchPlan(examples, float(seconds), seed, prove), keep, picture, as_json)

@@ -377,7 +377,7 @@ class _StudyReader:
         self.steps[key.text] = StudyStep(key, command, tuple(words), on_step, means, is_wrong)
 
     def step_words(self, command: tuple[str, ...], name: Scalar, value: Node) -> list[Scalar]:
-        """The words of an option of a step, or of what it works on; what is wrong is reported and left out."""
+        """Return the words of a step's option or of `on`; report invalid ones and omit them."""
         means, words = self.commands[command], self.reader.words(value)
         known = [word for word in words if self.names_are_known(word)]
         if name.text == "run" or name.text not in {*means, "on"}:
@@ -389,7 +389,7 @@ class _StudyReader:
         elif not words:
             self.error("PD806", f"`{name.text}` has no value", name.span)
         elif name.text == "on" and words[0].text.startswith("-"):
-            self.error("PD806", "what a step works on cannot begin with `-`", words[0].span)
+            self.error("PD806", "the value of `on` cannot begin with `-`", words[0].span)
         else:
             return known
         return []

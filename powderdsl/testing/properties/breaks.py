@@ -48,9 +48,9 @@ SIGMAS = 6.0
 
 @dataclass(frozen=True)
 class Breaks:
-    """`first` [B]: the step after which a world breaks the claim, 0 if it does not; `cell` [B, 2]: where.
+    """`first` [B]: the step after which a world breaks the claim, or 0; `cell` [B, 2]: where it breaks.
 
-    `counts` [B]: whether the world tests the claim: one that already starts as it forbids does not.
+    `counts` [B]: True if the world tests the claim. A world that violates the claim at the start does not.
     """
 
     first: Array
