@@ -4,8 +4,8 @@
     powderdsl record sand-pushing --policy expert --episodes 256 --out pushes
     python examples/behavior_cloning.py --task sand-pushing --data pushes
 
-The policy is fully convolutional: it maps a picture of element ids to one number for each thing that can be done at
-each bin of the action grid. So what it learns in one corner of the world holds in all the others.
+The policy is fully convolutional: it maps a picture of element ids to one number for each operation at each bin of the
+action grid. What it learns in one corner of the world therefore applies in all others.
 
 It prints a table of returns on worlds that training has never seen, and writes the learning curve to a CSV file.
 """
@@ -29,7 +29,7 @@ from powderdsl.tasks.players import ExpertPlayer
 
 
 class ConvPolicy(nn.Module):
-    """From observations, uint8 [B, 1, H, W], to logits [B, actions]: what can be done × rows × columns of bins."""
+    """From observations, uint8 [B, 1, H, W], to logits [B, actions]: operations × rows × columns of bins."""
 
     def __init__(self, bins: tuple[int, int], actions: int, width: int = 32):
         super().__init__()
@@ -43,9 +43,7 @@ class ConvPolicy(nn.Module):
             nn.ReLU(),
         )
         self.per_bin = nn.Conv2d(width, actions // (bins[0] * bins[1]), 1)
-        self.idle = nn.Linear(
-            width, 1
-        )  # doing nothing has no place; where it is not an action, it is cut off
+        self.idle = nn.Linear(width, 1)  # doing nothing has no location; drop it unless it is an action
 
     def forward(self, observed: Tensor) -> Tensor:
         embedded = self.elements(observed[:, 0].long()).permute(0, 3, 1, 2)
@@ -75,7 +73,7 @@ def returns_of(env: PowderVectorEnv, act: Callable[[np.ndarray], np.ndarray]) ->
     returns, over = np.zeros(env.num_envs), np.zeros(env.num_envs, bool)
     while not over.all():
         observed, reward, terminated, truncated, _ = env.step(act(observed))
-        returns += reward * ~over  # an environment whose episode is over plays another one meanwhile
+        returns += reward * ~over  # a finished environment plays another episode meanwhile
         over |= terminated | truncated
     return returns
 
@@ -99,7 +97,7 @@ def compare(env: PowderVectorEnv, policy: nn.Module) -> dict[str, np.ndarray]:
 
 
 def evaluate(policy: nn.Module, rows: Transitions, encode: Callable[[Tensor], Tensor]) -> tuple[float, float]:
-    """Cross-entropy, and how often the likeliest action is the expert's, over all rows."""
+    """Cross-entropy, and the share of rows in which the likeliest action is the expert's."""
     loss, right = 0.0, 0
     with torch.no_grad():
         for batch in DataLoader(
@@ -114,10 +112,10 @@ def evaluate(policy: nn.Module, rows: Transitions, encode: Callable[[Tensor], Te
 def train(policy: nn.Module, env: PowderVectorEnv, args: argparse.Namespace) -> list[dict[str, float]]:
     """Fit the policy to the recorded actions. Returns the learning curve, one row for each evaluation."""
     data = [Dataset.open(folder) for folder in args.data]
-    for one in data:
-        one.require(env.tensors)  # elements, sizes and actions mean what they mean in the environment
+    for dataset in data:
+        dataset.require(env.tensors)  # the same elements, sizes and actions
     training, held_out = split(Transitions(data), (0.9, 0.1), seed=args.seed)  # by world
-    encode = env.tensors.action_form.encode  # from the five recorded numbers to the one of this environment
+    encode = env.tensors.action_form.encode  # from five recorded numbers to one
     optimizer = torch.optim.Adam(policy.parameters(), args.lr)
     curve, begun, update = [], time.perf_counter(), 0
     generator = torch.Generator().manual_seed(args.seed)

@@ -5,9 +5,9 @@
     powderdsl record sand-pushing --policy random --episodes 192 --out random-pushes
     python examples/iql.py --task sand-pushing --data pushes random-pushes
 
-Nobody says which episodes are good. IQL learns a value V that lies above the average outcome of the recorded actions
-(an expectile), a Q by one step of look-ahead to V, and a policy that imitates the actions whose Q exceeds V. It never
-asks for the value of an action that was not recorded. Here, Q and V are two heads of one network.
+Episodes are not labeled as good or bad. IQL learns a value V above the average outcome of the recorded actions (an
+expectile), a Q by one step of look-ahead to V, and a policy that imitates the actions whose Q exceeds V. It never
+needs the value of an action that was not recorded. Here, Q and V are two heads of one network.
 
 It prints a table of returns on worlds that training has never seen, and writes the learning curve to a CSV file.
 """
@@ -45,9 +45,7 @@ class Grid(nn.Module):
             nn.ReLU(),
         )
         self.per_bin = nn.Conv2d(width, actions // (bins[0] * bins[1]), 1)
-        self.idle = nn.Linear(
-            width, 1
-        )  # doing nothing has no place; where it is not an action, it is cut off
+        self.idle = nn.Linear(width, 1)  # doing nothing has no location; drop it unless it is an action
         self.whole = nn.Sequential(nn.Linear(2 * width, 64), nn.ReLU(), nn.Linear(64, 1))
 
     def forward(self, observed: Tensor) -> tuple[Tensor, Tensor]:
@@ -67,13 +65,13 @@ def returns_of(env: PowderVectorEnv, act: Callable[[np.ndarray], np.ndarray]) ->
     returns, over = np.zeros(env.num_envs), np.zeros(env.num_envs, bool)
     while not over.all():
         observed, reward, terminated, truncated, _ = env.step(act(observed))
-        returns += reward * ~over  # an environment whose episode is over plays another one meanwhile
+        returns += reward * ~over  # a finished environment plays another episode meanwhile
         over |= terminated | truncated
     return returns
 
 
 def compare(env: PowderVectorEnv, policy: Grid, data: list[Dataset]) -> dict[str, np.ndarray]:
-    """Returns of the recorded episodes, of random actions, of the policy, and of the task's expert where it has one."""
+    """Returns of the recorded episodes, of random actions, of the policy, and of the task's expert, if it has one."""
     tensors, random = env.tensors, np.random.default_rng(0)
 
     def iql(observed: np.ndarray) -> np.ndarray:
@@ -98,7 +96,7 @@ def train(
 ) -> list[dict[str, float]]:
     """Learn V, Q and the policy from the recorded transitions. Returns the learning curve."""
     rows = Transitions(data)
-    critic = copy.deepcopy(policy)  # Q is its number for each action, V the one for the world
+    critic = copy.deepcopy(policy)  # Q has a number for each action, V one for the world
     target = copy.deepcopy(critic).requires_grad_(False)
     optimizer = torch.optim.Adam([*policy.parameters(), *critic.parameters()], args.lr)
     generator = torch.Generator().manual_seed(args.seed)
@@ -117,11 +115,11 @@ def train(
         weight = torch.where(advantage > 0, args.expectile, 1 - args.expectile)
         value_loss = (weight * advantage**2).mean()
 
-        # Q: the reward, and V of what came of it.
+        # Q: the reward, plus V of the next observation.
         q_loss = functional.mse_loss(q.gather(1, action)[:, 0], wanted_q)
 
-        # Policy: cloning, in which actions that beat V count more. Advantages are standardized, as in PPO: so one beta
-        # fits large and small rewards, and an error that V makes everywhere does not matter.
+        # Policy: cloning, weighted by the advantage over V. Advantages are standardized, as in PPO, so that one beta
+        # fits large and small rewards, and a constant error of V does not matter.
         gain = advantage.detach()
         gain = (gain - gain.mean()) / (gain.std() + 1e-8)
         trust = (args.beta * gain).exp().clamp(max=100)
@@ -160,8 +158,8 @@ def main(arguments: list[str] | None = None) -> dict[str, float]:
     parser.add_argument("--lr", type=float, default=1e-3)
     parser.add_argument("--gamma", type=float, default=0.97)
     parser.add_argument("--expectile", type=float, default=0.8)
-    parser.add_argument("--beta", type=float, default=2.0, help="how much better actions count more")
-    parser.add_argument("--tau", type=float, default=0.01, help="how fast the target follows Q")
+    parser.add_argument("--beta", type=float, default=2.0, help="weight of better actions")
+    parser.add_argument("--tau", type=float, default=0.01, help="rate at which the target follows Q")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--worlds", type=int, default=64, help="worlds of the split `test` to play in")
     parser.add_argument("--backend", default="auto", help="backend of the simulation")
@@ -178,8 +176,8 @@ def main(arguments: list[str] | None = None) -> dict[str, float]:
         backend=args.backend,
     )
     data = [Dataset.open(folder) for folder in args.data]
-    for one in data:
-        one.require(env.tensors)  # elements, sizes and actions mean what they mean in the environment
+    for dataset in data:
+        dataset.require(env.tensors)  # the same elements, sizes and actions
     policy = Grid(env.tensors.task.agent.bins, int(env.single_action_space.n))
     curve = train(policy, data, env.tensors.action_form.encode, args)
     with open(args.out, "w", newline="") as file:

@@ -1,4 +1,4 @@
-"""Goal-conditioned behavioral cloning on OGBench's Powderworld: learn from scripted play what leads to a goal.
+"""Goal-conditioned behavioral cloning on OGBench's Powderworld: learn from scripted play how to reach a goal.
 
     pip install 'powderdsl[rl]'
     powderdsl ogbench easy --episodes 100 --out ogbench-data
@@ -6,7 +6,7 @@
 
 The policy maps an observation and a goal to one of eight actions. It is trained on pairs from one episode: a row, its
 action, and as its goal a world that the same episode reaches a little later. It prints success on the level's five
-tasks, beside uniformly random actions, and writes the learning curve to a CSV file.
+tasks, compared with uniformly random actions, and writes the learning curve to a CSV file.
 """
 
 from __future__ import annotations

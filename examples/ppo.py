@@ -3,8 +3,8 @@
     pip install 'powderdsl[rl]'
     python examples/ppo.py --task burn-the-weeds
 
-Actor and critic share a fully convolutional network; the actor has one output for each thing that can be done at each
-bin of the action grid. It prints the returns of training episodes, then a table of returns on worlds that training has
+Actor and critic share a fully convolutional network; the actor has one output for each operation at each bin of the
+action grid. The script prints the returns of training episodes, then a table of returns on worlds that training has
 never seen, and writes the learning curve to a CSV file.
 """
 
@@ -41,9 +41,7 @@ class Agent(nn.Module):
             nn.ReLU(),
         )
         self.per_bin = nn.Conv2d(width, actions // (bins[0] * bins[1]), 1)
-        self.idle = nn.Linear(
-            width, 1
-        )  # doing nothing has no place; where it is not an action, it is cut off
+        self.idle = nn.Linear(width, 1)  # doing nothing has no location; drop it unless it is an action
         self.critic = nn.Sequential(nn.Linear(2 * width, 64), nn.ReLU(), nn.Linear(64, 1))
         for last in (self.per_bin, self.idle):
             nn.init.normal_(last.weight, std=0.01)  # nearly uniform at first
@@ -78,13 +76,13 @@ def returns_of(env: PowderVectorEnv, act: Callable[[np.ndarray], np.ndarray]) ->
     returns, over = np.zeros(env.num_envs), np.zeros(env.num_envs, bool)
     while not over.all():
         observed, reward, terminated, truncated, _ = env.step(act(observed))
-        returns += reward * ~over  # an environment whose episode is over plays another one meanwhile
+        returns += reward * ~over  # a finished environment plays another episode meanwhile
         over |= terminated | truncated
     return returns
 
 
 def compare(env: PowderVectorEnv, agent: Agent) -> dict[str, np.ndarray]:
-    """Returns of random actions, of the agent, and of the task's expert where it has one, in the same worlds."""
+    """Returns of random actions, of the agent, and of the task's expert, if it has one, in the same worlds."""
     tensors, random = env.tensors, np.random.default_rng(0)
 
     def ppo(observed: np.ndarray) -> np.ndarray:
@@ -129,7 +127,7 @@ def train(agent: Agent, envs: PowderVectorEnv, args: argparse.Namespace) -> list
             recent.extend(info["episode_return"][terminated | truncated])
             if (
                 truncated.any()
-            ):  # the rewards that an episode would still have had are estimated by the critic
+            ):  # the critic estimates the rewards that a truncated episode would still have had
                 last = torch.from_numpy(np.stack(list(info["final_obs"][truncated])))
                 with torch.no_grad():
                     rewards[step, torch.from_numpy(truncated)] += args.gamma * agent(last)[1]

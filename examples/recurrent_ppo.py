@@ -5,7 +5,7 @@
 
 The settings are those of `powderdsl train --preset small --epochs 4`, with an LSTM between the features and the policy, so
 its returns can be compared with those of the study `unseen-laws`. It prints the mean return of each run on its training
-worlds and on worlds of the split `test`, and writes them to a JSON file. Called again, it continues where it stopped.
+worlds and on worlds of the split `test`, and writes them to a JSON file. A second call resumes an interrupted one.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from powderdsl.tasks.shipped import load_task
 
 
 def make_env(args: argparse.Namespace, count: int, split: str) -> PowderVecEnv:
-    """`count` worlds of a split; those of training are under the first `--rulesets` rulesets."""
+    """`count` worlds of a split; training worlds use the first `--rulesets` rulesets."""
     rulesets = args.rulesets if split == "train" else 0
     program = compile_task(load_task(args.task), split=split, backend=args.backend, rulesets=rulesets)
     return PowderVecEnv(program, count, observation="ids", actions="full")
@@ -68,7 +68,7 @@ def play(model: RecurrentPPO, env: PowderVecEnv) -> float:
 
 
 def main(arguments: list[str] | None = None) -> dict[str, float]:
-    """Run what is missing. Returns the mean return on each split, over seeds."""
+    """Run the missing parts. Returns the mean return on each split, over seeds."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--task", default="find-the-solvent", help="a shipped task, or a task file")
     parser.add_argument("--rulesets", type=int, default=0, help="training rulesets; 0: all of the task's")

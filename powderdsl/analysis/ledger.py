@@ -239,11 +239,7 @@ class Ledger:
         if makers:
             return NotProven(f"`{element}` may come from other elements", tuple(makers))
         is_made = any(after == element for _, after in self.changes)
-        return Proven(
-            f"rules make `{element}` only where it already exists"
-            if is_made
-            else f"no rule makes `{element}`"
-        )
+        return Proven(f"rules only copy existing `{element}`" if is_made else f"no rule makes `{element}`")
 
     def reach(self, start: Iterable[str]) -> tuple[str, ...]:
         """All elements that a world can ever hold, if it starts with these and its fields were not set by hand.

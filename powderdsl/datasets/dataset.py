@@ -572,9 +572,7 @@ def split(
         selected._select(_Episodes(*(column[part == number] for column in episodes)))
         if not len(selected):
             count = len(rows.worlds) if by == "world" else len(episodes.number)
-            raise ValueError(
-                f"part {number} would be empty: {count} {by}s are too few, or choose another seed"
-            )
+            raise ValueError(f"part {number} would be empty: use more than {count} {by}s or another seed")
         parts.append(selected)
     return tuple(parts)
 

@@ -195,8 +195,7 @@ def kind_of(text: str) -> str:
 
 
 def completions(text: str, offset: int, rules: Rules, beside: Iterable[str]) -> list[Item]:
-    """The words that are allowed at a place of a text. `beside` are packs that may be named, in addition to shipped
-    ones."""
+    """The words that are allowed at a place of a text. `beside` are allowed packs, in addition to shipped ones."""
     cursor, kind = cursor_at(text, offset), kind_of(text)
     if cursor.key is None and (keys := keys_at(cursor.path, kind)):
         return [Item(key, "key", about) for key, about in keys.items()]

@@ -34,11 +34,11 @@ from powderdsl.ir.ops import (
 MAX_TABLE_BITS = 12
 
 MAX_GATES = 1 << 14
-"""Nodes of a pass on bit planes. Compiling this many takes a C++ compiler a quarter of a minute."""
+"""Maximum number of nodes of a pass on bit planes. A C++ compiler takes a quarter of a minute to compile this many."""
 
 
 class NotBits(Exception):
-    """Raised for a pass that bit planes cannot carry, but torch tensors can. `place` is the rule's file and line."""
+    """Raised for a pass that bit planes cannot express, but torch tensors can. `place` is the rule's file and line."""
 
     def __init__(self, why: str, place: str = ""):
         super().__init__(why)
@@ -110,7 +110,7 @@ class Gates(Graph):
         self.yes = self.flag(True)
         self.slots = slots or {}
         self.values: dict[Node, Any] = {}
-        """The flag or float that each lowered node has become, or the planes of its integer."""
+        """The flag or float that each node was lowered to, or the planes of its integer."""
 
     def derive(self, op: str, *args: Node, attr: Hashable = None) -> Node:
         known = simpler(self, op, args, attr) if args and args[-1].type == FLAG else None
@@ -126,7 +126,7 @@ class Gates(Graph):
         return super().derive(op, *args, attr=attr)
 
     def shift(self, a: Node, offset: Offset, wraps: bool = True) -> Node:
-        if a.type == REAL and a.op in ("const", "param"):  # lowering may have made a float uniform
+        if a.type == REAL and a.op in ("const", "param"):  # lowering may make a float uniform
             return self.shift_uniform(a, offset, wraps)
         if a is self.no or (a is self.yes and wraps):
             return a
@@ -144,7 +144,7 @@ class Gates(Graph):
         return self.fit([self.flag(bool(value >> i & 1)) for i in range(type.bits)], type)
 
     def fit(self, planes: Sequence[Node], type: Type) -> Bits:
-        """The same number in the planes of a range that holds it. They may lack the sign of one that has none."""
+        """The same number in the planes of a range that contains it. They may lack a sign if it is never negative."""
         fitted = [planes[min(i, len(planes) - 1)] for i in range(type.bits)]
         return (*fitted,) if type.signed else (*fitted, self.no)
 
@@ -154,7 +154,7 @@ class Gates(Graph):
         return self.derive("xor", half, c), self.or_(self.and_(a, b), self.and_(half, c))
 
     def pairs(self, a: Bits, b: Bits, count: int = 0) -> Iterator[tuple[Node, Node]]:
-        """The lowest bits of two numbers side by side, as many as the longer one has if no count is given."""
+        """The lowest `count` bits of two numbers, side by side; by default, as many as the longer one has."""
         for i in range(count or max(len(a), len(b))):
             yield a[min(i, len(a) - 1)], b[min(i, len(b) - 1)]
 
@@ -180,7 +180,7 @@ class Gates(Graph):
         return reduce(self.and_, same)
 
     def lt(self, a: Bits, b: Bits) -> Node:
-        """a < b: from the lowest bit, the highest difference decides."""
+        """a < b: the highest different bit decides; evaluated from the lowest bit up."""
         *pairs, signs = self.pairs(a, b)
         result = self.no
         for x, y in (*pairs, signs[::-1]):  # the sign counts the other way
@@ -188,7 +188,7 @@ class Gates(Graph):
         return result
 
     def choose(self, condition: Node, yes: Bits, no: Bits, type: Type) -> Bits:
-        """One number where a condition holds, the other elsewhere."""
+        """One number where a condition is true, the other elsewhere."""
         return self.fit([self.select(condition, *pair) for pair in self.pairs(yes, no, type.bits)], type)
 
     def divide(self, a: Bits, b: Bits, most: int) -> tuple[Bits, Bits]:
@@ -210,7 +210,7 @@ class Gates(Graph):
         return tuple(reversed(quotient)), rest
 
     def total(self, terms: Iterable[tuple[Node, int]], count: int) -> Bits:
-        """The sum of flags of some weights, as `count` planes and no sign: a carry-save tree."""
+        """The sum of weighted flags, as `count` planes without a sign: a carry-save tree."""
         columns: defaultdict[int, list[Node]] = defaultdict(list)
         for flag, weight in terms:
             for i in range(weight.bit_length()):
@@ -279,14 +279,14 @@ class Gates(Graph):
 
 
 class Split(NamedTuple):
-    """A truth table split on an input: its value where that holds, and elsewhere; `high` is None if they are opposite."""
+    """A truth table split on an input: its values for 1 and for 0; `high` is None if they are opposite."""
 
     input: int
     high: Split | None = None
     low: Split | None = None
-    """None of a table that is the same everywhere."""
+    """No gates, for a table that is the same everywhere."""
     cost: int = 0
-    """Gates; a half that is constant saves one."""
+    """The number of gates; a constant half saves one."""
 
 
 _NO, _YES = Split(-1), Split(-2)
@@ -305,7 +305,7 @@ def _split(matters: int, values: int, inputs: int, order: Sequence[int]) -> Spli
         return _YES if matters & values else _NO
     first, rest = order[0], order[1:]
     half, step = _half(inputs, first), 1 << first
-    # Numbers whose bit is 1 move to the places of those whose bit is 0, so that both halves can be compared.
+    # Numbers whose bit is 1 move to the positions of those whose bit is 0, so that both halves can be compared.
     low, high = matters & half, matters >> step & half
     nos, yeses = values & low, values >> step & high
     differ = (nos ^ yeses) & low & high
@@ -320,7 +320,7 @@ def _split(matters: int, values: int, inputs: int, order: Sequence[int]) -> Spli
 
 @lru_cache(maxsize=4096)
 def _best_split(matters: int, values: int, inputs: int, used: tuple[int, ...]) -> Split:
-    """The split that takes the fewest gates, of all orders of inputs; highest first where there are too many to try."""
+    """The split with the fewest gates, of all orders of inputs; highest first if there are too many to try."""
     orders = [used[::-1]] if len(used) > 5 else permutations(used)
     return min((_split(matters, values, inputs, order) for order in orders), key=operator.attrgetter("cost"))
 
@@ -338,7 +338,7 @@ def plane_slots(slots: Iterable[SlotType]) -> tuple[SlotType, ...]:
 
 
 def lower_bits(program: Program) -> Program:
-    """The program on bit planes. Raises NotBits for the first pass that they cannot carry."""
+    """The program on bit planes. Raises NotBits for the first pass that bit planes cannot express."""
     slots = plane_slots(program.slots)
     return replace(program, slots=slots, passes=tuple(map(partial(lower_pass, program), program.passes)))
 
@@ -383,7 +383,7 @@ def _by_bit(gates: Gates, node: Node) -> Bits:
 
 
 def _plane_by_plane(gates: Gates, node: Node, *args: Node | Bits) -> Bits:
-    """An operation that does the same with every plane. Flags serve all planes; swaps stay swaps of planes in place."""
+    """An operation that applies to every plane. Flags serve all planes; swaps remain swaps of planes in place."""
     planes = []
     for i in range(node.type.bits):
         parts = [arg if isinstance(arg, Node) else arg[min(i, len(arg) - 1)] for arg in args]
@@ -392,7 +392,7 @@ def _plane_by_plane(gates: Gates, node: Node, *args: Node | Bits) -> Bits:
 
 
 def _move(gates: Gates, node: Node, content: Node, movers: Node, rest: Node) -> Node:
-    """Floats are moved cell by cell anyway: choices between what neighbors hold."""
+    """Floats are moved cell by cell anyway: choices between the values of neighbors."""
     if content is rest and content.op == "const":
         return content
     if content.type == FLAG:
@@ -404,7 +404,7 @@ def _move(gates: Gates, node: Node, content: Node, movers: Node, rest: Node) -> 
 
 
 def _below(gates: Gates, node: Node, limit: Bits) -> Node:
-    """A draw below a limit. A constant limit is an attribute; another is given plane by plane, highest first."""
+    """A draw below a limit. A constant limit is an attribute; another is passed plane by plane, highest first."""
     stream, bits = node.attr
     (source,) = node.args
     if source.op == "select":
@@ -430,7 +430,7 @@ def _compare(gates: Gates, node: Node, a: Bits, b: Bits) -> Node:
         def test(number: int, side: Node = side, limit: int = other.attr) -> bool:
             return holds(number, limit) if side is left else holds(limit, number)
 
-        if side.op == "count" and side.type.lo >= 0:  # none or some: neighbors are joined, not counted
+        if side.op == "count" and side.type.lo >= 0:  # none or some: `or` of neighbors, without counting
             some = {test(number) for number in range(1, side.type.hi + 1)}
             if len(some) == 1 and test(0) not in some:
                 weights, wraps = side.attr
@@ -451,7 +451,7 @@ def _compare(gates: Gates, node: Node, a: Bits, b: Bits) -> Node:
 
 
 def _count(gates: Gates, node: Node, flag: Node) -> Bits:
-    """A kernel as adders: each pattern of a row once, then the rows; negative weights are added inverted."""
+    """A kernel as adders: each row pattern once, then the rows; negative weights are added inverted."""
     weights, wraps = node.attr
     sums: dict[object, list[Bits]] = {}
     terms: tuple[list[tuple[Node, int]], ...] = ([], [])
@@ -486,7 +486,7 @@ def _multiply(gates: Gates, node: Node, a: Bits, b: Bits) -> Bits:
 
 def _quotient(gates: Gates, node: Node, value: Bits, divisor: Bits) -> Bits:
     of, by = (arg.type for arg in node.args)
-    if by.lo == by.hi and by.lo > 0 and by.lo & (by.lo - 1) == 0:  # rounded down, as a shift is
+    if by.lo == by.hi and by.lo > 0 and by.lo & (by.lo - 1) == 0:  # rounded down, as a shift rounds
         return gates.fit(value[by.lo.bit_length() - 1 :] or value[-1:], node.type)
     if by.lo == by.hi and by.lo and of.bits <= MAX_TABLE_BITS // 2:
         return gates.look_up(value, of, lambda number: number // by.lo, node.type)
@@ -503,7 +503,7 @@ def _quotient(gates: Gates, node: Node, value: Bits, divisor: Bits) -> Bits:
 
 def _mod(gates: Gates, node: Node, value: Bits) -> Bits:
     modulus = node.attr
-    if modulus & (modulus - 1) == 0:  # its lowest bits; of a modulus of 1 none
+    if modulus & (modulus - 1) == 0:  # its lowest bits; none for a modulus of 1
         return gates.fit(value[: modulus.bit_length() - 1] or (gates.no,), node.type)
     if node.args[0].type.bits > MAX_TABLE_BITS // 2:
         _, rest = gates.divide(value, gates.constant(modulus), modulus)
@@ -570,7 +570,7 @@ _FLAT: dict[str, Callable[..., Node]] = {
     "swap": _move,
     "arrive": _move,
 }
-"""The nodes of operations on flags and floats that change on bit planes."""
+"""The nodes of operations on flags and floats that have another form on bit planes."""
 
 
 # Segments. Random numbers depend on streams, cells and steps, never on the pass: segments draw the same as the program.
@@ -586,7 +586,7 @@ class Segment:
 
 @dataclass(frozen=True)
 class PassForm:
-    """A pass and its form on bit planes, or the reason and the rule why bit planes cannot carry it."""
+    """A pass and its form on bit planes, or the reason why bit planes cannot express it, and the rule."""
 
     cells: PassGraph
     planes: PassGraph | None

@@ -63,7 +63,7 @@ COSINE = (1 / 24, -1 / 720, 1 / 40320, -1 / 3628800)
 """The series of sine and cosine from x³ and x⁴ on."""
 
 ROUNDER = 12582912.0
-"""1.5 · 2²³, which rounds what is added to it to an integer."""
+"""1.5 · 2²³: adding it to a number rounds the number to an integer."""
 
 
 @dataclass
@@ -74,7 +74,7 @@ class Inputs:
     build: Graph
     state: dict[str, Node]
     threshold: Threshold | None = None
-    """Chances are the number of draws below them if this is given, else floats."""
+    """If given, chances are the number of draws below them, else floats."""
 
     def stream(self, name: str) -> tuple[str, int]:
         """A stream and the bits of its draws."""
@@ -108,7 +108,7 @@ class Inputs:
         return self.build.derive("table", element, attr=tuple(int(value) for value in values))  # type: ignore[arg-type]  # only numbers are left
 
     def by_element(self, element: Node, values: list[Node]) -> Node:
-        """The value that belongs to the element: one select a distinct value."""
+        """The value of the element in each cell: one select per distinct value."""
         groups: dict[Node, set[int]] = {}
         for identity, value in enumerate(values):
             groups.setdefault(value, set()).add(identity)
@@ -309,10 +309,10 @@ def _wave(build: Graph, x: Node, cosine: bool) -> Node:
 
 Mover = Transform | Swap | Move
 Claim = tuple[Rule, Node]
-"""A rule and the cells in which it happens."""
+"""A rule and the cells in which it fires."""
 
 LIVE_BUDGET = 100_000
-"""Nodes evaluated to find rules that can never happen, a tenth of a second. After that every rule stays."""
+"""Maximum number of nodes evaluated to find rules that never fire: a tenth of a second. Beyond it, every rule stays."""
 
 
 def part_names(name: str, kind: Kind) -> tuple[str, ...]:
@@ -321,7 +321,7 @@ def part_names(name: str, kind: Kind) -> tuple[str, ...]:
 
 
 def ir_type(kind: Kind, ids: int = 256) -> Type:
-    """The IR type in which values of a kind are held; `ids` is the number of element ids."""
+    """The IR type that stores values of a kind; `ids` is the number of element ids."""
     types = {"flag": FLAG, "element": integer(0, ids - 1), "direction": integer(0, 7)}
     if kind.name in ("real", "vec2", "chance"):
         return REAL
@@ -372,7 +372,7 @@ def lower_condition(ruleset: Ruleset, condition: Expr) -> PassGraph:
 
 
 def live_passes(ruleset: Ruleset) -> tuple[Pass, ...]:
-    """The passes without rules whose conditions cannot hold: a loop writes many copies, of which few suit the elements."""
+    """The passes without rules whose conditions cannot hold: a loop writes many copies, few of which fit the elements."""
     facts = replace(facts_of(ruleset), budget=Budget(LIVE_BUDGET))
 
     def live(moment: Moment) -> Moment:
@@ -428,7 +428,7 @@ class _PassLowering:
             claims = self._keep_apart(claims, moment.policy)
         movers = [(rule, mask) for rule, mask in claims if not isinstance(rule, Assign)]
         assigns = [(rule, mask) for rule, mask in claims if isinstance(rule, Assign)]
-        # All values are those before the substep; effects land after the movements.
+        # All values are those before the substep; effects are written after the movements.
         writes, effects = (
             [
                 (write, mask, lower_expression(write.value, at))
@@ -464,10 +464,10 @@ class _PassLowering:
             self.state[name] = build.select(mask, new, old)
 
     def _move(self, movers: Sequence[tuple[Mover, Node]], at: Inputs, policy: str) -> None:
-        """Transforms and what moves leave behind first, then arrivals, all from the world before.
+        """Write transforms and the content left behind by moves, then arrivals, all from the world before.
 
-        Without a policy that keeps them apart, a cell may take part in several exchanges. They are then not swaps, of
-        which each cell belongs to one at most: movers take what their targets held, and what they held arrives there.
+        Unless a policy separates them, a cell may take part in several exchanges, which are then not swaps: in swaps,
+        each cell belongs to at most one. Movers take the content of their targets, where their own content arrives.
         """
         build, state = self.build, self.state
         before = dict(state)
@@ -513,7 +513,7 @@ class _PassLowering:
         build = self.build
 
         def reach(rule: Rule, cells: Node, way: int) -> Node:
-            """The cells and their targets; for way -1 the cells and the cells whose targets they are."""
+            """The cells and their targets; for way -1, the cells and the movers that target them."""
             return build.any([build.shift(cells, (way * dy, way * dx)) for dy, dx in footprint(rule)])
 
         narrowed: list[Claim] = []

@@ -106,12 +106,12 @@ def larger(a: float, b: float) -> float:
 
 @dataclass(frozen=True)
 class Op:
-    """A row of the table: the kinds of the arguments and of the result, and what follows from them.
+    """A row of the table: the kinds of the arguments and of the result, and facts derived from them.
 
-    Kinds are names of types, `?` for any, `=` for arguments that are alike, `*` for any number of them. `bounds` gives the
-    range of an integer result for the types of the arguments, `evaluate` the result for their values, with which stages
-    fold constants; both take `attr` first if there is one. Without `evaluate` the result depends on more than these.
-    `gates` is the cost of the operation on bit planes.
+    Kinds are names of types, `?` for any, `=` for arguments of equal kind, `*` for any number of arguments. `bounds`
+    gives the range of an integer result for the types of the arguments, `evaluate` the result for their values, with
+    which stages fold constants; both take `attr` first if there is one. Without `evaluate` the result depends on more
+    than these. `gates` is the cost of the operation on bit planes.
     """
 
     name: str
@@ -164,8 +164,8 @@ def _union(a: Type, b: Type) -> Range:
 
 # fmt: off
 _TABLE = (
-    # where values come from
-    Op("input", (), "?", "slot", "what the pass finds in a slot"),
+    # sources of values
+    Op("input", (), "?", "slot", "the value of a slot before the pass"),
     Op("const", (), "?", "value", "the same everywhere"),
     Op("param", (), "?", "(name, threshold or None[, bit])", "one number a world: its value, or a chance as a threshold"),
     Op("coordinate", (), "?", "(row | column | step, modulus[, bit])"),
@@ -207,7 +207,7 @@ _TABLE = (
     Op("to_real", ("?",), "real"),
     Op("settle", ("real",), "real", "(low, high)", "NaN → 0, clamped to the bounds, smaller than SNAP → 0", evaluate=_settle),
     # choices and movements
-    Op("select", ("flag", "=", "="), "=", "", "second argument where the first holds, else the third",
+    Op("select", ("flag", "=", "="), "=", "", "second argument where the first is true, else the third",
        lambda condition, yes, no: _union(yes, no), gates=3),
     Op("swap", ("=", "flag", "="), "=", "offset", "(content, movers, rest): movers and their targets exchanged",
        lambda offset, content, movers, rest: _union(content, rest)),
@@ -224,7 +224,7 @@ COMMUTATIVE = frozenset(op.name for op in _TABLE if op.commutative)
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Node:
-    """An operation on nodes. Made by `Graph.node` only; identity is equality within a graph."""
+    """An operation on nodes. Created only by `Graph.node`; identity is equality within a graph."""
 
     op: str
     type: Type
@@ -232,7 +232,7 @@ class Node:
     attr: Any
     index: int
     places: tuple[str, ...] = field(default=(), repr=False)
-    """The rule's file and line: ``rules/acme.yaml:12``. It takes no part in interning."""
+    """The rule's file and line: ``rules/acme.yaml:12``. Interning ignores it."""
 
     def is_input(self, slot: str) -> bool:
         """True if the node is the value of a slot before the pass."""
@@ -240,12 +240,12 @@ class Node:
 
 
 class Graph:
-    """Makes and interns nodes. Arguments of commutative operations are sorted, except floats: their order is kept."""
+    """Creates and interns nodes. Arguments of commutative operations are sorted, except floats, which keep their order."""
 
     def __init__(self) -> None:
         self._nodes: dict[Hashable, Node] = {}
         self.place = ""
-        """The file and line of the rule for which nodes are made."""
+        """The file and line of the rule for which nodes are created."""
 
     def copy(self) -> Graph:
         """A graph with the same nodes, to which others can be added."""
@@ -299,7 +299,7 @@ class Graph:
         return self.derive("or", a, b)
 
     def any(self, flags: Sequence[Node]) -> Node:
-        """The flag that holds where any of some flags holds."""
+        """The flag that is true where any of some flags is."""
         return reduce(self.or_, flags) if flags else self.flag(False)
 
     def select(self, condition: Node, yes: Node, no: Node) -> Node:
@@ -309,7 +309,7 @@ class Graph:
         return self.derive("in_set", value, attr=members)
 
     def clamp(self, a: Node, lo: int, hi: int) -> Node:
-        """Integers clamped to bounds, where their range asks for it."""
+        """Integers clamped to bounds, if their range exceeds them."""
         if a.type.lo < lo:
             a = self.derive("max", a, self.integer(lo))
         if a.type.hi > hi:
@@ -422,7 +422,7 @@ class Program:
 
 
 def needed(roots: Iterable[Item], below: Callable[[Item], Sequence[Item]]) -> dict[Item, Sequence[Item]]:
-    """Some items and all items below them, each after the items directly below it, mapped to these."""
+    """Map some items, and all items below them, each after the items directly below it."""
     done: dict[Item, Sequence[Item]] = {}
     begun: dict[Item, Sequence[Item]] = {}
     stack = [*roots][::-1]
@@ -472,7 +472,7 @@ def walk(node: Node) -> Iterator[Node]:
 
 
 def conjunctions(node: Node) -> Iterator[Node]:
-    """A flag and the flags that must all hold for it to hold, each once, in order."""
+    """A flag and the flags whose conjunction it is, each once, in order."""
     stack = [node]
     for top in taken(stack):
         yield top

@@ -38,7 +38,7 @@ def rewrite_pass(pass_: PassGraph, rules: Sequence[Rewrite]) -> PassGraph:
     done: dict[Node, Node] = {}
     """Nodes of the new graph by those of the old one."""
     final: dict[Node, Node] = {}
-    """What nodes of the new graph were rewritten to."""
+    """The rewritten forms of nodes of the new graph."""
 
     def finish(node: Node) -> Node:
         """A node of the new graph, rewritten. Arguments that a rule has made are finished first, the last before the others."""
@@ -75,7 +75,7 @@ def fold(node: Node, build: Graph) -> Node | None:
             # x in S and x in T = x in S ∩ T, x in S or x in T = x in S ∪ T
             return build.in_set(x, s & t if node.op == "and" else s | t)
         case "in_set", (x,), members:
-            # x in {} = no, x in everything = yes; values outside the range of x are left out
+            # x in {} = no, x in everything = yes; values outside the range of x are dropped
             reachable = frozenset(i for i in members if x.type.lo <= i <= x.type.hi)
             if len(reachable) in (0, x.type.hi - x.type.lo + 1):
                 return build.flag(bool(reachable))
@@ -90,7 +90,7 @@ def fold(node: Node, build: Graph) -> Node | None:
         case "lt", (Node("const", attr=limit), Node("sqrt", args=(x,))), _ if 0 <= limit < 1e18:
             # c < √x = c' < x, where the square of c must be finite
             return build.derive("lt", build.real(_last_square(single(limit))), x)
-        # Zeros of either sign are alike: clamping makes them one, nothing tells them apart.
+        # Zeros of either sign are equal: clamping makes them one, and nothing distinguishes them.
         case "add" | "sub", (a, Node("const", attr=0)), _:  # a + 0 = a, a - 0 = a
             return a
         case "add", (Node("const", attr=0), b), _:
@@ -130,7 +130,7 @@ MAX_VALUES = 16
 
 
 def resolve(node: Node, build: Graph) -> Node | None:
-    """Questions about properties become questions about elements: densities vanish, sets of ids remain."""
+    """Turn questions about properties into questions about elements: densities vanish, sets of ids remain."""
     holds: Callable[..., bool] = partial(OPS[node.op].value, None)
     match node.op, node.args, node.attr:
         case "shift", (Node("table", _, (x,), values),), (dy, dx, True):
@@ -152,7 +152,7 @@ def resolve(node: Node, build: Graph) -> Node | None:
 
 
 def _is_table(node: Node) -> bool:
-    """True for a property, and for a stored element id: both are tested best with sets of ids."""
+    """True for a property and for a stored element id: both are best tested with sets of ids."""
     stored = node
     while stored.op == "shift":
         stored = stored.args[0]
@@ -208,7 +208,7 @@ def _tables(node: Node, known: Tables) -> frozenset[Node]:
 
 
 def share(node: Node, build: Graph) -> Node | None:
-    """Shifts move outwards over what is computed cell by cell: one read a neighbor and value, shared by all rules.
+    """Shifts move outward past operations on single cells: one read per neighbor and value, shared by all rules.
 
     Values are then combined before the shift, and a shifted flag is cheaper than a shifted number.
     """
@@ -258,7 +258,7 @@ def prune(pass_: PassGraph) -> PassGraph:
 
 
 class Stage(NamedTuple):
-    """A stage of the compiler: its name, one line of help, and what it does to one pass of a program."""
+    """A stage of the compiler: its name, one line of help, and its effect on one pass of a program."""
 
     name: str
     about: str
@@ -267,12 +267,12 @@ class Stage(NamedTuple):
 
 PIPELINE: tuple[Stage, ...] = (
     Stage("fold", "folds constants and flags that are always equal", partial(rewrite_pass, rules=[fold])),
-    # Before sharing: what a neighbor's property decides becomes a question about its element.
+    # Before sharing: questions about a neighbor's property become questions about its element.
     Stage("specialise", "replaces the properties of a cell whose element is known", specialise),
     Stage("resolve", "turns tests of properties into tests of the element", partial(rewrite_pass, rules=[resolve, fold])),
     # After resolving: only now is it clear which neighbors are read.
     Stage("share", "reads each value of a neighbor once", partial(rewrite_pass, rules=[share, fold])),
-    # Last: substeps whose rules have turned out never to fire no longer write anything.
+    # Last: substeps whose rules never fire no longer write anything.
     Stage("prune", "removes substeps that change nothing", prune),
 )  # fmt: skip
 

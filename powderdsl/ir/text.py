@@ -1,4 +1,4 @@
-"""Passes as text: a stable printed form for `--emit ir`, golden tests and bug reports, and digests to recognize them by."""
+"""Passes as text: a stable printed form for `--emit ir`, golden tests and bug reports, and digests that identify them."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from powderdsl.ir.ops import Node, PassGraph, Program, needed, nodes_of
 
 
 def print_program(program: Program, only: str | None = None) -> str:
-    """All passes (or one) as text: a line a node, what each substep writes, what the pass leaves."""
+    """All passes (or one) as text: a line per node, the writes of each substep, the slots that the pass changes."""
     lines = [f"program {program.name}"]
     for slot in program.slots:
         note = " resets each step" if slot.resets else ""
@@ -24,7 +24,7 @@ def print_program(program: Program, only: str | None = None) -> str:
 
 
 def _pass_lines(pass_: PassGraph) -> list[str]:
-    """One pass. Numbers are given in order of use, so that they do not depend on what was built and dropped."""
+    """One pass. Numbers are assigned in order of use, so that they do not depend on nodes that were dropped."""
     names: dict[Node, str] = {}
     lines = [f"pass {pass_.name}"]
 

@@ -15,8 +15,7 @@ FALSE, TRUE = 0, 1
 
 
 class Net:
-    """Creates gates: ``and``, ``xor``, ``choice`` (the second input if the first is true, else the third),
-    ``variable``.
+    """Creates gates: ``and``, ``xor``, ``choice`` (second input if the first is true, else third), ``variable``.
 
     Equal gates are one object; gates of constants and of equal or opposite literals fold. Gate 0 is the constant.
     """

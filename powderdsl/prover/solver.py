@@ -1,7 +1,6 @@
 """A SAT solver in plain Python that learns clauses from conflicts.
 
-Internally, literal v is the code 2 v and -v is 2 v + 1, so `code ^ 1` is the negation. Values are stored as the false
-codes.
+Internally, literal v is the code 2 v and -v is 2 v + 1, so `code ^ 1` is the negation. False codes are stored.
 """
 
 from __future__ import annotations
@@ -53,9 +52,7 @@ class Solver:
         self._conflicts = 0
         self._due = KEPT
         self._learned: list[tuple[int, list[int]]] = []  # clauses with the number of their levels
-        self._used: set[int] = (
-            set()
-        )  # ids of clauses that took part in conflicts since clauses were last dropped
+        self._used: set[int] = set()  # ids of clauses in conflicts since clauses were last dropped
 
     def add_clause(self, literals: Iterable[int]) -> None:
         """Require that one of the literals is true; variables are created on demand."""

@@ -405,8 +405,7 @@ class Names:
 
 
 class Evaluation:
-    """Nodes as formulas over an earlier world. Nodes of `cut` may have any value, in the plane of the world that it
-    names."""
+    """Nodes as formulas over an earlier world. Nodes of `cut` may have any value, in the plane that it names."""
 
     def __init__(self, before: World, symbols: Symbols, names: Names | None = None) -> None:
         self.before, self.symbols, self.names = before, symbols, names or Names()

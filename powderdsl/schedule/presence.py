@@ -16,7 +16,7 @@ MAX_PLANES = 6
 """A set of ids is a word of 64 bits."""
 
 MAX_SETS = 4
-"""More sets than this are not worth testing."""
+"""Maximum number of sets to test."""
 
 _ELEMENT = "element:"
 

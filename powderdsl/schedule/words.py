@@ -30,7 +30,7 @@ from powderdsl.schedule.types import (
 )
 
 MAX_CONDITIONS = 4
-"""More sets of planes than this are not worth testing."""
+"""Maximum number of sets of planes to test."""
 
 
 def skip_empty(schedule: Schedule) -> Schedule:

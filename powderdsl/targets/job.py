@@ -15,7 +15,7 @@ from powderdsl.targets.array_kind import Array
 
 
 def now(device: Any) -> float:
-    """The time in seconds, once a GPU has done what it was asked to: it works asynchronously."""
+    """The time in seconds, after a GPU, which works asynchronously, has finished its work."""
     if getattr(device, "type", "") == "cuda":
         import torch
 
@@ -37,14 +37,14 @@ class PassClock:
         self.seconds[name] += self._last - last
 
     def add(self, name: str, seconds: float) -> None:
-        """Count time that a program measured itself."""
+        """Add time that a program measured itself."""
         self.seconds[name] += seconds
 
 
 class Clock(NamedTuple):
     """Seed and world index of each world, int64 [B], and its step: `since` steps after `start`, int64 [B].
 
-    The sum is computed only when it is read: a step of one small world takes no longer than a few operations of torch.
+    The sum is computed only when it is read: a step of one small world takes no longer than a few torch operations.
     """
 
     seed: Array
@@ -152,9 +152,9 @@ def shape_of(state: Mapping[str, Array]) -> tuple[int, int, int]:
 class Job(NamedTuple):  # created at each call, faster than a frozen dataclass
     """Steps of a batch of worlds.
 
-    `state` has one array per slot, in storage dtypes, and is not changed unless `reuse`. `params` are float64 [B], in a
-    mapping that nobody changes: programs cache inputs by its identity. `draws`, int64 [B, H, W] below 2^bits, replace a
-    stream's numbers; `passes` names the passes to run, None for all.
+    `state` has one array per slot, in storage dtypes, and is not changed unless `reuse`. `params` are float64 [B], in
+    a mapping that must not change: programs cache inputs by its identity. `draws`, int64 [B, H, W] below 2^bits,
+    replace a stream's numbers; `passes` names the passes to run, None for all.
     """
 
     state: Mapping[str, Array]

@@ -27,7 +27,7 @@ class Printer:
             yield from getattr(self, type(statement).__name__.lower())(statement)
 
     def compute(self, loop: Compute) -> Any:
-        """A loop over words: an operation on whole planes, planes that are computed anew, or an update where a mask holds."""
+        """A loop over words: an operation on whole planes, newly computed planes, or an update where a mask holds."""
         if len(loop.outs) == 1 and loop.over == "words" and is_whole(loop.outs[0].value):
             return self.whole(loop.outs[0])
         return self.words(loop) if loop.region is None else self.update(loop)
@@ -90,7 +90,7 @@ GATES = {
 
 
 class WordText(Values[str]):
-    """Flags as text, a word at a time. `type` is the type of a word."""
+    """Flags as text, one word at a time. `type` is the type of a word."""
 
     type: str
 
@@ -117,7 +117,7 @@ def drawn_where(draw: Node) -> Node | None:
 
 
 MAX_PRINTED = 1000
-"""With more repeated choices, each is computed once, before those that need it, whether its cells are chosen or not."""
+"""Maximum number of repeated choices; beyond it, each is computed once, before those that need it, in all cells."""
 
 
 class CellValues(Values[Named]):

@@ -1,5 +1,4 @@
-"""Generates the text of a universe from a seed and the pieces in `rules/universes/laws.yaml`, which explains their
-form."""
+"""Generates a universe's text from a seed and the pieces in `rules/universes/laws.yaml`, which explains their form."""
 
 from __future__ import annotations
 

@@ -197,8 +197,7 @@ class Session:
         return ledger_text(ledger(self._rules()))
 
     def invariants(self) -> list[dict[str, Any]]:
-        """The invariants: `proven` with the method and reason, `tried` on worlds, or `broken` with a small
-        counterexample."""
+        """The invariants: `proven` with method and reason, `tried` on worlds, or `broken` with a small counterexample."""
         from powderdsl.testing.properties.outcomes import counterexample_lines
         from powderdsl.testing.properties.search import quick_results
 

@@ -29,18 +29,18 @@ from powderdsl.system import cache
 from powderdsl.system.writing import scratch_folder
 
 INSTALL = "install g++ or clang++, or `pip install powderdsl[native]`"
-"""Advice where there is no compiler."""
+"""Advice if there is no compiler."""
 
 MISSING = "no C++ compiler"
-"""The beginning of the messages of `NoCompiler` where none was found."""
+"""The beginning of the messages of `NoCompiler` if none was found."""
 
 
 class NoCompilerWarning(UserWarning):
-    """The backend `auto` has work that is worth compiling, and no compiler."""
+    """Raised if the backend `auto` has work that is worth compiling, but no compiler."""
 
 
 class NoCompiler(Exception):
-    """No C++ compiler that works was found, or it failed; the message says what was tried."""
+    """Raised if no working C++ compiler was found, or it failed; the message lists the attempts."""
 
 
 @dataclass(frozen=True)
@@ -54,7 +54,7 @@ class Compiler:
 
 
 def find_compiler() -> Compiler:
-    """The compiler of `$CXX`; without that the first of g++, c++, clang++ and the `ziglang` package that works.
+    """The compiler of `$CXX`; without that, the first of g++, c++, clang++ and the `ziglang` package that works.
 
     Raises NoCompiler if none works. If `$CXX` is set, no other compiler is tried.
     """
@@ -81,7 +81,7 @@ def find_compiler() -> Compiler:
 
 @lru_cache(maxsize=8)
 def _version(command: tuple[str, ...], program: str) -> str:
-    """The first line of `--version`; empty if the command, which is this program, does not run."""
+    """The first line of `--version`; empty if the command does not run, or runs this program."""
     nothing = subprocess.DEVNULL
     try:
         output = subprocess.check_output([*command, "--version"], stdin=nothing, stderr=nothing, timeout=30)
@@ -119,7 +119,7 @@ def flags_for(compiler: Compiler, level: str, machine: str = "", features: str =
     if on_x86 and ("avx512f" in features if name == "native" else name.endswith("v4")):
         flags.append("-mprefer-vector-width=512")
     if compiler.family == "gcc":
-        # On such long functions these two take most of the time and gain nothing.
+        # on such long functions, these two take most of the time for no benefit
         flags += ["-fno-gcse", "-fno-tree-pre"]
     else:
         flags.append("-fno-slp-vectorize")  # the code is vectorized already: a tenth faster without
@@ -167,7 +167,7 @@ _building: ContextVar[Building] = ContextVar("building", default=FOR_USERS)
 
 @contextmanager
 def building(how: Building) -> Iterator[None]:
-    """Use other settings inside the block: tests of thousands of rulesets need neither -O2 nor the user's cache."""
+    """Use other settings inside the block: tests of thousands of rulesets do not need -O2 or the user's cache."""
     token = _building.set(how)
     try:
         yield
@@ -181,9 +181,9 @@ def current() -> Building:
 
 @contextmanager
 def turn(folder: Path, key: str) -> Iterator[None]:
-    """Let one process at a time into the block, up to a time limit: all of them would compile the same source.
+    """Let one process at a time into the block, up to a time limit, so that only one compiles the same source.
 
-    The operating system releases the lock of a process that dies. Without file locks, nobody waits.
+    The operating system releases the lock of a process that dies. Without file locks, no process waits.
     """
     lock = FileLock(folder / f"{key}.lock")
     with suppress(OSError, NotImplementedError, Timeout):

@@ -142,7 +142,7 @@ class _Loop(CellValues[str]):
         layout.cover(marks=number + 1 if plan.marked else 0, marked=len(plan.marked))
 
     def before(self) -> Iterator[str]:
-        """Statements before the loop: memory for what it writes, and the marks of its rows."""
+        """Statements before the loop: memory for its results, and the marks of its rows."""
         for out in self.lasting:
             field = f"overtaken(c, {out.into})" if out.into else "take_field(c)"
             yield f"{out.var.name} = {field}; bool some{out.var.name} = false; no_rows(c, {out.var.name});"
@@ -188,7 +188,7 @@ class _Loop(CellValues[str]):
             yield f"float* o{name} = {row};"
 
     def ends(self) -> Iterator[str]:
-        """The columns beyond the edges of what the loop has written."""
+        """The columns beyond the edges of the rows that the loop has written."""
         for name in self.fields:
             if self.is_bare(name):
                 bare = self.rows.rings[name].bare

@@ -16,7 +16,7 @@ _OPS = {"not": 2, "and": 3, "or": 4, "xor": 5}
 _PLANE, _MASK, _NOTHING = 0, 1, 6
 
 MOST_GATES = 512
-"""The most gates that are worth it: the library evaluates each gate for each word."""
+"""Maximum number of gates, since the library evaluates each gate for each word."""
 
 
 @dataclass(frozen=True)
@@ -69,7 +69,7 @@ class CellCounts:
         rows: tuple[int, int],
     ):
         self.numbers = frozenset(count.number for count in counted)
-        """The measures that are counted."""
+        """The counted measures."""
         gates: list[tuple[int, int, int]] = []
         places: dict[Node, int] = {}
 

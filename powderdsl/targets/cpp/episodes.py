@@ -1,4 +1,4 @@
-"""The layout of what a library needs to step the episodes of a task in one call: `Play` of episodes.hpp."""
+"""The data layout for stepping the episodes of a task in one call: `Play` of episodes.hpp."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class Formula(ctypes.Structure):
 
 
 class Fresh(ctypes.Structure):
-    """What a placed element sets in a slot, by the agent's choice: int64, or float32 if there are no bits."""
+    """The values that a placed element sets in a slot, by the agent's choice: int64, or float32 if there are no bits."""
 
     _fields_ = (("slot", ctypes.c_int64), ("bits", ctypes.c_int64), ("values", ctypes.c_void_p))
 
@@ -31,7 +31,7 @@ def _whole(names: str) -> tuple[tuple[str, Any], ...]:
 
 
 class Play(ctypes.Structure):
-    """Everything that a step reads and writes. Addresses are those of arrays that the caller keeps."""
+    """Everything that a step reads and writes. Addresses point to arrays that the caller keeps."""
 
     _fields_ = (
         *_whole("threads steps free_steps actions limit mode last_terminates counts_always"),

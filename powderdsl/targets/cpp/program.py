@@ -1,4 +1,4 @@
-"""The native backend: worlds stay packed between calls; tensors are made when they are read."""
+"""The native backend: worlds stay packed between calls; tensors are created when they are read."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ from powderdsl.targets.job import Job, Like, OwnedBatch, like_of, shape_of
 from powderdsl.targets.layout import Layout, Piece, parameters, pieces
 
 KEPT_INPUTS = 16
-"""The number of mappings of parameters whose inputs a program keeps."""
+"""The number of parameter mappings whose inputs a program caches."""
 
 
 @dataclass(frozen=True)
 class NativeCode:
-    """A program as compiled C++: enough to run it again without lowering anything.
+    """A program as compiled C++, with everything to run it again without lowering.
 
-    `width` is that of grids (`source.known_width`); `pieces` are those of each state tensor, `passes` the names of passes.
+    `width`: of grids (`source.known_width`); `pieces`: of each state tensor; `passes`: their names.
     """
 
     library: Path
@@ -69,7 +69,7 @@ def recall(key: str) -> NativeCode | None:
 
 
 def remember(key: str, code: NativeCode) -> None:
-    """Store the rest of a compiled program under a key. A cache that cannot be written only costs time."""
+    """Store the rest of a compiled program under a key. If the cache cannot be written, only time is lost."""
     with suppress(OSError):
         cache.add(current().place(), key, pickle.dumps(code), f"{code.library.name.split('-')[2]}.layout")
 
@@ -100,12 +100,12 @@ VIEWS = ("values", "colors", "ramp", "tint", "channels", "codes", "planes")
 
 
 class Views:
-    """What native code writes into an observation, part by part."""
+    """The parts of an observation that native code writes."""
 
     def __init__(self) -> None:
         self.parts: list[View] = []
         self.tables: list[list[Tensor]] = []
-        """Those of each part."""
+        """The parts."""
 
     def add(
         self, kind: str, *numbers: int, number: float = 0, tables: Sequence[Tensor] = (), offset: int = 0
@@ -118,7 +118,7 @@ class Views:
 
     @cached_property
     def array(self) -> Any:
-        """All parts, as the library takes them."""
+        """All parts, in the form that the library reads."""
         return (View * len(self.parts))(*self.parts)
 
 
@@ -204,7 +204,7 @@ class PackedState(OwnedBatch):
 
 
 class Places:
-    """Where generated code keeps the pieces of a state: `homes` are as `Layout.home` gives them, by slot."""
+    """Where generated code stores the pieces of a state: `homes` are the results of `Layout.home`, by slot."""
 
     def __init__(self, layout: Layout, pieces: Mapping[str, tuple[Piece, ...]]):
         self.layout, self.pieces = layout, pieces
@@ -219,7 +219,7 @@ class NativeProgram(Places):
         self.library = load_library(code.library)
         self.code, self.threads = code, threads
         self._inputs: dict[int, Inputs] = {}
-        """By the `id` of the mapping, which the inputs keep alive."""
+        """Keyed by the `id` of the mapping, which the inputs keep alive."""
 
     def run(self, job: Job) -> Mapping[str, Tensor]:
         """The state `job.steps` later. Jobs with given draws or chosen passes are for other backends."""

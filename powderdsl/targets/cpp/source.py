@@ -14,7 +14,7 @@ from powderdsl.targets.cpp.text import pass_text
 from powderdsl.targets.layout import NativeLayout, braced, literal, native_layout
 
 GENERATOR_VERSION = 13
-"""Part of every cache key; increase it when generated code changes meaning."""
+"""Part of every cache key; increase it when the meaning of generated code changes."""
 
 LIBRARY = ("vectors", "runtime", "planes", "movements", "fields")
 """Headers before the generated passes, in this order."""
@@ -22,7 +22,7 @@ DRIVER = ("driver", "views", "episodes")
 """Headers after the generated passes."""
 
 UNIT_SIZE = 40_000
-"""Letters of generated passes from which compiling two units side by side is faster."""
+"""Minimum number of letters of generated passes for which compiling two units side by side is faster."""
 
 ELEMENT = "element:"
 ONLY_IN = "#if !defined(UNIT) || UNIT == "
@@ -37,10 +37,10 @@ class NativeSource(NamedTuple):
 
 
 def known_width(width: int) -> int:
-    """The width that a library for grids of this width is compiled for; 0 if it takes any width.
+    """The width for which a library for grids of this width is compiled; 0 if it takes any width.
 
     Rows of whole words have a library for each width: words have 64 columns, or all columns of 8, 16 or 32. All other
-    widths share one.
+    widths share one library.
     """
     return width if width in (8, 16, 32) or width % 64 == 0 else 0
 
@@ -110,7 +110,7 @@ def _tables(program: Program, layout: NativeLayout, tested: int) -> Iterator[str
 
 
 def _assign_units(passes: Sequence[str], units: int, driver: int) -> Iterator[str]:
-    """The passes, spread over units of about the same length; the first unit also has a driver of `driver` letters."""
+    """The passes, divided into units of about the same length; the first unit also has a driver of `driver` letters."""
     sizes = [driver, *[0] * (units - 1)]
     chosen: dict[str, int] = {}
     for text in sorted(passes, key=len, reverse=True):

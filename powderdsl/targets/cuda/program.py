@@ -37,7 +37,7 @@ _DYNAMIC_SHARED = 8
 
 
 class NoCuda(Exception):
-    """No CUDA device, driver or NVRTC that works was found; the message names it."""
+    """Raised if no working CUDA device, driver or NVRTC was found; the message names it."""
 
 
 class Worlds(ctypes.Structure):
@@ -74,7 +74,7 @@ def nvrtc(version: str) -> ctypes.CDLL:
     for name in names:
         try:
             for beside in glob.glob(str(Path(name).parent / "libnvrtc-builtins.so.*")) if "/" in name else ():
-                ctypes.CDLL(beside)  # NVRTC opens it by name, without looking in its own folder
+                ctypes.CDLL(beside)  # NVRTC opens it by name, without searching its own folder
             return ctypes.CDLL(name)
         except OSError:
             continue

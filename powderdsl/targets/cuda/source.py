@@ -13,7 +13,7 @@ from powderdsl.targets.cuda.text import pass_text
 from powderdsl.targets.layout import Layout, layout_of, literal
 
 GENERATOR_VERSION = 2
-"""Part of every cache key; increase it when generated code changes meaning."""
+"""Part of every cache key; increase it when the meaning of generated code changes."""
 
 WARP = 32
 MAX_THREADS = 1024
@@ -76,7 +76,7 @@ def cuda_source(program: Program, height: int, width: int, shared_limit: int) ->
     fields_fit = planes_fit and uniform + planes + fields <= shared_limit
     scratch = planes * (not planes_fit) + fields * (not fields_fit)
     shared = uniform + planes + fields - scratch
-    # As many blocks as the chip's memory holds, but not so many that registers run out.
+    # As many blocks as the chip's memory can contain, but not more than its registers allow.
     blocks = max(1, min(shared_limit // (shared + RESERVED), REGISTERS // (threads * ENOUGH)))
     head = {
         "HEIGHT": height, "WIDTH": width, "ROW_WORDS": row_words, "GROUP": group,

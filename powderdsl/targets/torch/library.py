@@ -29,7 +29,7 @@ class Portable:
     """The operations on words and cells of worlds of one size."""
 
     axes = (0, 1)
-    """Of the rows and columns of cells."""
+    """Axes of the rows and columns of cells."""
 
     def __init__(self, batch: int, height: int, width: int, device: torch.device):
         self.batch, self.height, self.width, self.device = batch, height, width, device
@@ -38,10 +38,10 @@ class Portable:
         self.everywhere, self.nowhere = self._by_row([-1]), self._by_row([0])
         self.valid = self._by_row([(1 << width) - 1])
         self.fixed: dict[Any, Any] = {}
-        """Constants of this size that were computed before, by any key."""
+        """Constants for this size that were computed before, by key."""
 
     def whole(self, plane: Tensor) -> Tensor:
-        """A plane [H, B, K], or some: those that all cells share are expanded."""
+        """One or more planes [H, B, K]; those that all cells share are expanded."""
         return plane if plane.shape[-3:] == self.shape else plane.expand(*plane.shape[:-3], *self.shape)
 
     def stack(self, planes: Sequence[Tensor]) -> Tensor:
@@ -124,7 +124,7 @@ class Portable:
         words = [np.frombuffer((row % (1 << size)).to_bytes(size // 8, "little"), "<i8") for row in rows]
         return torch.from_numpy(np.stack(words).astype(np.int64))[:, None].to(self.device)
 
-    # Movements of planes [P, H, B, K]. No cell is a mover and a target of the same exchange.
+    # Movements of planes [P, H, B, K]. No cell is both a mover and a target of the same exchange.
 
     def swap(self, planes: Tensor, movers: Tensor, dy: int, dx: int) -> Tensor:
         """Planes whose movers and targets are exchanged."""
@@ -132,24 +132,24 @@ class Portable:
         return self.shift(change, -dy, -dx).bitwise_xor_(change).bitwise_xor_(planes)
 
     def left(self, *kinds: Leftover) -> Any:
-        """What movers leave behind in each plane, in the form that `leave` takes."""
+        """The content that movers leave behind in each plane, in the form that `leave` takes."""
         shown = [[[[-(kind == of)]]] for of in ("same", "everything") for kind in kinds]
         return torch.tensor(shown, device=self.device).view(2, -1, 1, 1, 1)
 
     def leave(self, planes: Tensor, movers: Tensor, dy: int, dx: int, left: Any) -> Tensor:
-        """Planes whose targets get what the movers hold; other movers leave something behind."""
+        """Planes whose targets get the content of the movers; other movers leave something behind."""
         targets = self.shift(movers, -dy, -dx)
         stays, fills = left
         rest = (planes & (~movers | stays)) | (movers & fills)
         return (rest & ~targets) | self.shift(planes & movers, -dy, -dx)
 
     def arrive(self, planes: Tensor, movers: Tensor, rest: Tensor, dy: int, dx: int) -> Tensor:
-        """Other planes, whose targets get what the movers hold in these."""
+        """Other planes, whose targets get the content of the movers in these planes."""
         targets = self.shift(movers, -dy, -dx)
         return rest ^ (targets & (rest ^ self.shift(planes, -dy, -dx)))
 
     def exchange(self, planes: Tensor, movers: Tensor, rest: Tensor, dy: int, dx: int) -> Tensor:
-        """Other planes, whose movers and targets get what their partners hold in these."""
+        """Other planes, whose movers and targets get the content of their partners in these planes."""
         arrived = self.arrive(planes, movers, rest, dy, dx)
         return arrived ^ (movers & (arrived ^ self.shift(planes, dy, dx)))
 
@@ -161,7 +161,7 @@ class Portable:
         return (lower.to(torch.int64) & MASK) | (upper.to(torch.int64) << 32)
 
     def _numbers(self, bits: int, halves: slice) -> Tensor:
-        """What enters the hash for each bit and some halves of words: int32 [bits, H, 1, halves]."""
+        """The input of the hash for each bit and some halves of words: int32 [bits, H, 1, halves]."""
         count = -(-self.width // 32)  # the last word may lack a half
         half = torch.arange(2 * self.across, dtype=torch.int32, device=self.device)[halves]
         half = half.clamp(max=count - 1)
@@ -223,7 +223,7 @@ class Portable:
         return ((words >> self._columns()) & 1).flatten(-3, -2)[..., : self.width, :]
 
     def _columns(self) -> Tensor:
-        # Made anew: kernels compute it, where they would read a tensor that is kept.
+        # Computed again: kernels compute it where they would otherwise read a stored tensor.
         return torch.arange(WORD, device=self.device)[:, None]
 
     def mask(self, plane: Tensor) -> Tensor:
@@ -263,7 +263,7 @@ class Portable:
         return self.choose(mask, value + by if sign > 0 else value - by, value)
 
     def carry(self, value: Tensor, mask: Tensor, amount: Tensor, dy: int, dx: int) -> Tensor:
-        """A float of which an amount leaves where a mask holds, and arrives where it holds at a neighbor."""
+        """A float from which an amount leaves where a mask holds, and arrives where the mask holds at a neighbor."""
         left = self.choose(mask, value - amount, value)
         arrived = left + self.neighbor(amount, dy, dx)
         return self.choose(self.shift(mask, dy, dx), arrived, left)
@@ -297,7 +297,7 @@ class Portable:
 _BITS = torch.tensor([[octet >> i & 1 for i in range(8)] for octet in range(256)], dtype=torch.uint8)
 _MASKS = -_BITS.to(torch.int32)
 _GATHER = 0x0102040810204080
-"""Times this, a word of eight bytes 0 or 1 has them as the bits of its last byte."""
+"""Multiplying a word of eight bytes 0 or 1 by this collects them as the bits of its last byte."""
 _BELOW_SNAP = float(np.nextafter(np.float32(SNAP), np.float32(0)))
 
 
@@ -379,7 +379,7 @@ class Eager(Portable):
         return self.tensor(value).view(torch.int32)
 
     def increase(self, value: Tensor | float, mask: Tensor, by: Tensor | float, sign: int = 1) -> Tensor:
-        # x + 0 = x, except that -0 becomes 0, which no rule can tell apart and no field holds.
+        # x + 0 = x, except that -0 becomes 0, which rules cannot distinguish and fields never contain.
         return torch.add(self.tensor(value), self.choose(mask, by, 0.0), alpha=sign)
 
     def increase_(self, value: Any, mask: Tensor, by: Tensor | float, sign: int = 1) -> Tensor:
@@ -396,7 +396,7 @@ class Eager(Portable):
         return value.sub_(moved).add_(neighbors)
 
     def _framed(self, dy: int, dx: int) -> tuple[Tensor, Tensor, list[tuple[Tensor, Tensor]]]:
-        """Memory for a float of each cell, the part of it at a neighbor, and what must be copied around the edges."""
+        """Memory for a float of each cell, the part of it at a neighbor, and the parts to copy around the edges."""
         if ("framed", dy, dx) not in self.fixed:
             height, ys, to_y, edge_y = _frame(dy, self.height)
             width, xs, to_x, edge_x = _frame(dx, self.width)
@@ -418,7 +418,7 @@ class Eager(Portable):
 
 
 def _frame(by: int, size: int) -> tuple[int, slice, slice, list[tuple[slice, slice]]]:
-    """An axis with room for neighbors around the edge: its size, the cells, their neighbors, borders and what they repeat."""
+    """An axis with room for neighbors around the edge: its size, cells, their neighbors, borders and their sources."""
     by = (by + size // 2) % size - size // 2
     before = max(-by, 0)
     cells, neighbors = slice(before, before + size), slice(before + by, before + by + size)

@@ -22,7 +22,7 @@ from powderdsl.targets.torch.program import step_keys
 from powderdsl.targets.torch.source import load_source
 
 CHUNK = 1 << 18
-"""Cells of the worlds that an eager program steps together: about as many as the cache holds."""
+"""Cells of the worlds that an eager program steps together: about as many as fit into the cache."""
 
 MOST_SIZES = 8
 
@@ -62,7 +62,7 @@ class PlanesProgram:
 
     def __init__(self, program: Program, planes: Program, device: torch.device, *, fuse: bool = False):
         self.device, self.planes, self._fuse = device, planes, fuse
-        # glibc maps large blocks anew for each tensor until it has freed a larger one, and clearing pages takes half the time.
+        # glibc maps large blocks anew for each tensor until it frees a larger one; clearing pages takes half the time.
         torch.empty(31 << 20, dtype=torch.uint8)
         self.eager = device.type == "cpu" and sys.byteorder == "little" and not fuse
         self._pieces = pieces(program)
@@ -148,7 +148,7 @@ class PlanesProgram:
     # Inputs of passes
 
     def _parameters(self, params: Mapping[str, Tensor], part: slice) -> dict[Key, Any]:
-        """What depends on parameters. Limits that all worlds share are numbers where that costs no sync."""
+        """Inputs that depend on parameters. Limits that all worlds share are numbers if that needs no sync."""
         values: dict[Key, Any] = {}
         for key in self._keys("limit", "bit", "real"):
             kind, name, *rest = key

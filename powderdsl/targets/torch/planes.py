@@ -53,7 +53,7 @@ def planes_source(program: Program, only: str | None = None) -> str:
 
 @dataclass
 class _Line:
-    """A statement ``name = text``. `op` names an operation that makes a new tensor, or that may overwrite an argument."""
+    """A statement ``name = text``. `op` names an operation that creates a tensor or may overwrite an argument."""
 
     name: str
     text: str
@@ -122,7 +122,7 @@ class _Writer:
         """The name of each node, or the text of a constant."""
         self.constants: dict[Node, float] = {}
         self.full: set[str] = set()
-        """Names of planes that no operation broadcasts: only those can be overwritten."""
+        """Names of planes that no operation broadcasts: only these can be overwritten."""
         self.known: dict[str, str] = {}
         self.inputs: dict[Key, int] = {}
         self.blocks: dict[Node, tuple[_Block, int]] = {}
@@ -179,7 +179,7 @@ class _Writer:
         return node.args
 
     def movement(self, node: Node) -> Key | None:
-        """What planes that move together share: operation, offset, movers, and whether the rest is simple; else None."""
+        """The key of planes that move together: operation, offset, movers, and whether the rest is simple; else None."""
         if node.op not in ("swap", "arrive"):
             return None
         kind = leftover(node.args[0], node.args[2], node.args[1])
@@ -356,7 +356,7 @@ class _Writer:
                 self.blocks[plane] = (moved, i)
 
     def block(self, planes: list[Node]) -> _Block:
-        """A tensor that holds some planes: the one that they are in, unless it has many others."""
+        """A tensor that contains some planes: the one that they are in, unless it has many others."""
         home, _ = self.blocks.get(planes[0], (None, 0))
         alone = len(set(planes)) == len(planes)
         if home and alone and set(planes) <= set(home.planes) and len(home.planes) <= 2 * len(planes):
@@ -395,7 +395,7 @@ class _Writer:
         for i, line in enumerate(self.lines):
             last |= dict.fromkeys(line.args, i)
         own: set[str] = set()
-        """Planes in memory of their own, which no other name shares."""
+        """Planes in separate memory, which no other name shares."""
         texts = []
         for i, line in enumerate(self.lines):
             free = [arg for arg in line.args if arg in own and last[arg] == i and arg not in returned]
@@ -407,7 +407,7 @@ class _Writer:
 
 
 def _in_place(line: _Line, free: list[str], full: set[str]) -> str:
-    """The text of an operation that overwrites an argument, or makes one temporary plane less; else nothing."""
+    """The text of an operation that overwrites an argument, or creates one temporary plane less; else nothing."""
     if line.text.startswith(_REUSING):
         return line.text.replace("(", "_(", 1) if line.args[0] in free else ""
     if line.op == "select" and line.name[0] == "n":
@@ -423,7 +423,7 @@ def _in_place(line: _Line, free: list[str], full: set[str]) -> str:
 
 
 class _Carried(NamedTuple):
-    """A float of which an amount leaves the cells of movers and enters their targets."""
+    """A float from which an amount leaves the cells of movers and enters their targets."""
 
     old: Node
     movers: Node

@@ -132,11 +132,11 @@ def pass_source(pass_: PassGraph, number: int) -> tuple[str, str, dict[str, obje
 
 
 def with_deletions(lines: list[str], returned: str) -> list[str]:
-    """The lines with `del` after the last use of each plane, so that a large world needs memory for few planes at once."""
+    """The lines with `del` after the last use of each plane, so that only few planes need memory at once."""
     live = set(_PLANE.findall(returned))
     result: list[str] = []
     for line in reversed(lines):
-        # Rules may call a field `n1`: what stands in quotes is no variable.
+        # Rules may call a field `n1`: quoted text is not a variable.
         used = [] if line.startswith("#") else _PLANE.findall(_QUOTED.sub("", line))
         dead = sorted(set(used[1:]) - live)
         if dead:
@@ -147,7 +147,7 @@ def with_deletions(lines: list[str], returned: str) -> list[str]:
 
 
 def comment_of(text: str) -> str:
-    """A place as a comment. File names come from users: nothing in them may end the comment."""
+    """A place as a comment. File names come from users and must not end the comment."""
     return "".join(char if char.isprintable() and ord(char) < 128 else "?" for char in text)
 
 

@@ -35,13 +35,13 @@ BITS = struct.pack("<4I", 1, 2, 4, 8)
 
 
 def _best(instruction: str, a: Value, b: Value) -> Value:
-    """The smaller or larger number; NaN if either is one, as NumPy's minimum and maximum have it."""
+    """The smaller or larger number; NaN if either is NaN, as in NumPy's minimum and maximum."""
     a, b = (arg if isinstance(arg, Local) else body.let(arg) for arg in (a, b))
     return choose(op("f32x4.ne", a, a), a, op(instruction, b, a))
 
 
 def _settled(value: Value, low: float, high: float) -> Value:
-    """A number that may be stored: clamped, 0 for a NaN and for what is too small."""
+    """A number that may be stored: clamped, and 0 for NaN and for tiny values."""
     x = body.let(value)
     x &= op("f32x4.eq", x, x)
     x.set(op("f32x4.pmin", op("f32x4.pmax", x, floats(low)), floats(high)))

@@ -60,13 +60,13 @@ WORLDS, GROUPS = Member("i32.load", host.WORLDS), Member("i32.load", host.GROUPS
 PAGE = 1 << 16
 GOLDEN, FIRST, SECOND = 0x9E3779B1, 0x7FEB352D, 0x846CA68B
 MOST_BITS = 64
-"""The most bits of a draw."""
+"""Maximum number of bits of a draw."""
 
 AHEAD = 4
 """Bits of a draw that are computed together, since the multiplications of one bit wait for each other."""
 
 MAX_PARAMS = 1000
-"""The most parameters of a function that engines accept; more are passed in variables of the module."""
+"""Maximum number of parameters of a function in engines; more are passed in variables of the module."""
 
 UNROLLED = 4
 """Words of a row up to which they are read without a loop."""
@@ -213,7 +213,7 @@ class Library:
         self.turns = defaultdict[int, Global](partial(variable, "i32"))
         """Variables with numbers of columns modulo the width, unless that is fixed."""
         self.top = variable("i32", memory.top)
-        """The beginning of memory that was never used."""
+        """The beginning of memory that has never been used."""
         self.planes, self.fields = variable("i32"), variable("i32")
         """The first free plane and field."""
         self.rows, self.lines, self.cells = variable("i32"), variable("i32"), variable("i32")

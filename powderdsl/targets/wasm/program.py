@@ -20,7 +20,7 @@ from powderdsl.targets.layout import layout_of, parameters, pieces
 from powderdsl.targets.wasm.host import GROUPS, HEADER, Compiled, aligned, numbers_of, this_host
 
 ROOM = 1 << 30
-"""Bytes of memory from which an instance takes no new batches. The other half remains for its batches to step and read."""
+"""Bytes of memory beyond which an instance takes no new batches. Its batches need the rest for steps and reads."""
 
 _MODULES = Memo(versions=1, things=64)
 """The compiled modules of this process: tests, tasks and environments reuse rules and widths."""
@@ -45,7 +45,7 @@ class WasmProgram:
         self._instances: dict[tuple[int, int, bool], Instance] = {}
 
     def module(self, width: int) -> Compiled:
-        """The module for a width. Tests and examples are narrow, of many widths, and run too shortly to repay one each."""
+        """The module for a width. Many small widths share one: tests and examples run too briefly to justify their own."""
         fixed = width if width == 32 or width >= 64 else None
 
         def code() -> bytes:
@@ -60,7 +60,7 @@ class WasmProgram:
         return _MODULES.of((self._digest, fixed), "", make)
 
     def instance(self, worlds: int, rows: int, width: int) -> Instance:
-        """The instance for new batches of a shape: a new instance when the memory of the last is full."""
+        """The instance for new batches of a shape: a new instance when the memory of the last one is full."""
         key = (rows, width, worlds == 1)  # with one world, lanes may be strips
         instance = self._instances.get(key)
         if instance is None or instance.running.memory_size() > ROOM:
@@ -87,7 +87,7 @@ class WasmProgram:
 
 
 class Instance:
-    """An instance of a module, for worlds of one number of rows. As a context manager, it lets one thread call functions.
+    """An instance of a module, for one number of rows. As a context manager, it lets one thread call functions.
 
     Its memory is freed when no batch in it is used any more.
     """
@@ -97,7 +97,7 @@ class Instance:
         self.width, self.running = width, program.module(width)()
         self.call = self.running.call
         self.gone: list[tuple[int, int]] = []
-        """Batches that nobody uses any more, with their numbers of worlds."""
+        """Unused batches, with their numbers of worlds."""
         self._free: defaultdict[int, list[int]] = defaultdict(list)
         """Batches to reuse, by number of worlds."""
         self._lock = RLock()

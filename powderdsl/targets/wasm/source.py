@@ -41,7 +41,7 @@ from powderdsl.targets.wasm.words import WordLoop
 ONE = const("i32", 1)
 
 PAGES = 1 << 15
-"""The most pages of 64 KiB that a module's memory has: 2 GiB, so that no sum of two sizes passes 32 bits."""
+"""Maximum number of pages of 64 KiB of a module's memory: 2 GiB, so that no sum of two sizes exceeds 32 bits."""
 
 
 @collection_paused()
