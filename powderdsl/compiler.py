@@ -328,7 +328,7 @@ class _Reader:
         for word in left_out:
             if word not in packs:
                 helps = suggest(word, packs, "packs")
-                self.reporter.error("PD304", f"`{word}` is left out, but it was not there", None, helps=helps)
+                self.reporter.error("PD304", f"`{word}` is left out, but no pack loads it", None, helps=helps)
         if not names:
             example = "name a shipped ruleset or a file: `powderworld`"
             self.reporter.error("PD304", "no rules were named", None, helps=[example])

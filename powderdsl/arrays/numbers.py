@@ -89,7 +89,7 @@ def promote(a: Type, b: Type) -> Type:
         return float32 if narrow else float64
     large, small = (a, b) if a.itemsize >= b.itemsize else (b, a)
     if large.kind != small.kind and (large.kind == "u" or large.itemsize == small.itemsize):
-        raise TypeError(f"{a} with {b} is not there without NumPy")
+        raise TypeError(f"{a} with {b} is not supported without NumPy")
     return large
 
 
@@ -118,7 +118,7 @@ def pack_exactly(numbers: Iterable[Any], kind: Type) -> Values:
     items = list(numbers)
     if kind.kind == "f":
         if kind is float32 and any(type(number) is int and abs(number) > 1 << 53 for number in items):
-            raise OverflowError("integers that would be rounded twice are not there without NumPy")
+            raise OverflowError("integers that would be rounded twice are not supported without NumPy")
         return array(kind.code, map(float, items))
     if kind is bool_:
         return bytes(map(bool, items))
@@ -200,7 +200,7 @@ _COMPARISONS: dict[str, Callable[[Any, Any], bool]] = {
 def arithmetic(op: str, a: Values, b: Values, kind: Type, count: int) -> Values:
     """An operation on values of one type. Raises TypeError if the type does not have it."""
     if op not in {"b": _OF_FLAGS, "f": _OF_FLOATS}.get(kind.kind, (*_OF_INTEGERS, "minimum", "maximum")):
-        raise TypeError(f"{op} of {kind} is not there without NumPy")
+        raise TypeError(f"{op} of {kind} is not supported without NumPy")
     if len(a) == len(b) == 1:
         count = 1
     if op in (*_OF_FLAGS, "add") and isinstance(a, bytes) and isinstance(b, bytes):

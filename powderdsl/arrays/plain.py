@@ -29,7 +29,7 @@ Shape = tuple[int, ...]
 
 
 def __getattr__(name: str) -> Any:
-    message = f"`{name}` is not there without NumPy"
+    message = f"`{name}` is not supported without NumPy"
     raise AttributeError(message) if name.startswith("_") else ModuleNotFoundError(message, name="numpy")
 
 
@@ -40,7 +40,7 @@ def _reduction(call: Callable[[Values], Any], result: Type | None = None) -> Any
         full, kind = self.full, result or self.dtype
         real = self.dtype.kind == "f" and kind is not bool_
         if (call is sum and self.dtype.kind not in "bi") or (real and any(value != value for value in full)):
-            raise TypeError("sums of such numbers and extremes of NaN are not there without NumPy")
+            raise TypeError("sums of such numbers and extremes of NaN are not supported without NumPy")
         axes = range(self.ndim)
         reduced = [axes[i] for i in (axes if axis is None else [axis] if isinstance(axis, int) else axis)]
         rest = [i for i in axes if i not in reduced]
@@ -74,7 +74,7 @@ class ndarray:
         """All values, or one if they are equal."""
         if self._base is not None and self._base._written != self._seen:
             raise ValueError(
-                "a view of an array that was written to is not there without NumPy: copy it first"
+                "a view of an array that was written to is not supported without NumPy: copy it first"
             )
         return self._values
 
@@ -168,7 +168,7 @@ class ndarray:
 
     def __setitem__(self, key: Any, value: Any) -> None:
         if self._base is not None:
-            raise ValueError("writing to a view is not there without NumPy: copy it first")
+            raise ValueError("writing to a view is not supported without NumPy: copy it first")
         new_values = asarray(value, self.dtype)
         axes, shape, _ = self._select(key)
         old, new = numbers.unify([self.full, broadcast_to(new_values, shape).full], self.dtype)
@@ -185,7 +185,7 @@ class ndarray:
         if any(isinstance(item, ndarray) for item in items):  # integers beside arrays are like them
             arrays = [at for at, item in enumerate(items) if isinstance(item, (ndarray, int))]
             if arrays != [*range(arrays[0], arrays[-1] + 1)]:
-                raise IndexError("arrays that are apart in an index are not there without NumPy")
+                raise IndexError("arrays that are apart in an index are not supported without NumPy")
         axes: list[Offsets] = []
         shape: list[int] = []
         together: list[ndarray] = []
@@ -222,7 +222,7 @@ class ndarray:
 
 def _map(call: Callable[[Any], Any], array: ndarray, kinds: str) -> ndarray:
     if array.dtype.kind not in kinds:
-        raise TypeError(f"{call} of {array.dtype} is not there without NumPy")
+        raise TypeError(f"{call} of {array.dtype} is not supported without NumPy")
     return ndarray(array.shape, array.dtype, numbers.pack([*map(call, array.values)], array.dtype))
 
 
@@ -232,7 +232,7 @@ def _part(item: Any) -> Any:
         return item
     array = asarray(item, int64) if isinstance(item, list) and not item else asarray(item)
     if array.dtype.kind == "f" or (array.dtype is bool_ and not array.shape):
-        raise IndexError(f"an index of {array.dtype} is not there without NumPy")
+        raise IndexError(f"an index of {array.dtype} is not supported without NumPy")
     return array if array.shape else int(array)
 
 
@@ -294,7 +294,7 @@ def _nested(values: Any) -> tuple[Shape, list[Any]]:
         return (len(values),), list(values)
     parts = [_nested(part) for part in values]
     if len({shape for shape, _ in parts}) > 1:
-        raise ValueError("lists of different lengths are no array")
+        raise ValueError("lists of different lengths cannot form an array")
     return (len(values), *parts[0][0]), [leaf for _, leaves in parts for leaf in leaves]
 
 
@@ -540,6 +540,6 @@ def searchsorted(values: ndarray, wanted: ndarray, side: str = "left") -> ndarra
     """The number of ascending numbers below each of others, or not above each (``right``)."""
     call, listed = bisect_left if side == "left" else bisect_right, values.tolist()
     if bool(isnan(wanted).any()):
-        raise TypeError("searchsorted of NaN is not there without NumPy")
+        raise TypeError("searchsorted of NaN is not supported without NumPy")
     counts = [call(listed, number) for number in wanted.values]
     return ndarray(wanted.shape, int64, numbers.pack_exactly(counts, int64))

@@ -309,7 +309,7 @@ def find_played(
     if is_task(name):
         return load_task(name, knobs=knobs, params=settings, packs=packs)
     if knobs or settings:
-        raise BadInput("--knob and --set go with a task: a run has its own")
+        raise BadInput("--knob and --set require a task: a run has its own values")
     from powderdsl.experiments.runs import find_run
 
     return find_run(name, "ppo")

@@ -76,7 +76,7 @@ def start_drawn(
     if name.lower().endswith(".npz"):
         for option, value in {"size": size, "batch": batch, "seed": seed}.items():
             if value is not None:
-                raise BadInput(f"--{option} does not go with this world: a saved world has its own")
+                raise BadInput(f"--{option} cannot be used with this world: a saved world has its own")
         return None
     from powderdsl.worlds.store import drawn_world
 

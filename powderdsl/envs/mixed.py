@@ -141,7 +141,7 @@ class MixedEnv(CompiledEnv):
             )
             if ours != theirs:
                 rules = "+".join(self.program.rulesets[number])
-                raise ValueError(f"{self.task.name}: observations or actions are others under {rules}")
+                raise ValueError(f"{self.task.name}: observations or actions differ under {rules}")
             self._envs[number] = env
         return self._envs[number]
 
@@ -305,7 +305,7 @@ class MixedEnv(CompiledEnv):
         for number, saved in state["groups"].items():
             rows = saved["rows"].numpy().copy()
             if not 0 <= number < len(self.program.rulesets):
-                raise ValueError(f"there is no ruleset {number}: there are {len(self.program.rulesets)}")
+                raise ValueError(f"no ruleset {number}: there are {len(self.program.rulesets)}")
             env = CompiledEnv(self.program.under(number), len(rows))
             env.restore(saved["env"])
             episodes, returned, params = env.episodes, env.returns, env.params

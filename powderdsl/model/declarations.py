@@ -388,7 +388,7 @@ class _PackReader(Reader):
         if ruleset is not None and ruleset.without:
             first = ruleset.without[0]
             self.reporter.error(
-                "PD304", f"`{first.text}` is left out of nothing", first.span, "this ruleset does not extend another",
+                "PD304", f"`{first.text}` is left out, but nothing includes it", first.span, "this ruleset does not extend another",
                 helps=["remove `without`, or add `extends`"],
             )  # fmt: skip
         return ruleset

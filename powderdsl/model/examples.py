@@ -154,7 +154,7 @@ class _ExampleReader:
         expect = self._rows(decl.expect, wildcard=True) if decl.expect else None
         size = f"`given` has {len(given)} row{'s' * (len(given) != 1)} of {len(given[0])}"
         if expect and decl.expect and (len(expect), len(expect[0])) != (len(given), len(given[0])):
-            raise typer.fail("PD110", "`expect` has another size than `given`", decl.expect.span, size)
+            raise typer.fail("PD110", "`expect` and `given` have different sizes", decl.expect.span, size)
         elements = self.composition.elements
         ids = {**self.ids, **{character: elements[meaning].id for character, meaning in self.legend.items()}}
         fields = self._grids(decl.fields, ids, size, expected=False)
@@ -305,7 +305,7 @@ class _ExampleReader:
         everywhere = len(words) == 1
         if not everywhere and list(map(len, rows)) != list(map(len, self.given)):
             raise self.typer.fail(
-                "PD110", f"`{key.text}` has another size than `given`", places[0] if places else key.span, size,
+                "PD110", f"`{key.text}` and `given` have different sizes", places[0] if places else key.span, size,
                 f"write a word for each cell, or one for all cells: {FORMS[kind.name][1]}",
             )  # fmt: skip
         read: dict[str, Cell] = {DEFAULT: ()} | ({ANYTHING: None} if expected else {})

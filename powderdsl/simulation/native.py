@@ -245,7 +245,7 @@ class AutoProgram:
         return (self._native or self._large()).run(job)
 
     def _slice(self, cells: int, left: int) -> int:
-        """The number of steps to run on the first backend before the next check: one until their speed is known."""
+        """The number of steps to run on the first backend before the next check: 1 until their speed is known."""
         if self._problem:
             return left
         if self._pace is None or self._pace[0] != cells:

@@ -277,7 +277,7 @@ class Simulator:
         from powderdsl.simulation.observe import Observer
 
         if self.kind.xp.__name__ != "torch":
-            raise TypeError("observations are torch tensors, and these worlds are compiled without torch")
+            raise TypeError("observations require torch, but these worlds are compiled without it")
         return Observer(self.ruleset, self.device)
 
     @property

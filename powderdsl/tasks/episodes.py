@@ -224,7 +224,7 @@ class TaskProgram:
         state = tensors(saved["state"])
         names = {slot.name for slot in self.simulator.slots}
         if set(state) != names or tuple(state["element"].shape[1:]) != self.task.size:
-            raise ValueError(f"these episodes are not of {self.task.name}: another state, or another size")
+            raise ValueError(f"these episodes do not belong to {self.task.name}: their state or size differs")
         seed, index, step = (_copy(part, device) for part in saved["clock"])
         regions, targets = {**tensors(saved["regions"]), **self.fixed}, tensors(saved["targets"])
         return Episodes(

@@ -116,7 +116,7 @@ def drawn_world(name: str, ruleset: Ruleset, size: Size | None) -> Start:
     if suffix in (".png", ".txt"):
         kind, read = ("a picture", read_image) if suffix == ".png" else ("a drawing", load_ascii)
         if size is not None:
-            raise ValueError(f"size does not go with this world: {kind} has its own")
+            raise ValueError(f"size cannot be used with this world: {kind} has its own")
         return Start(read(name, ruleset.elements), {})
     if suffix not in (".yaml", ".yml"):
         if Path(name).is_file():

@@ -269,13 +269,15 @@ def test_types_of_results() -> None:
 def test_views_are_not_written_through() -> None:
     array: Any = plain.zeros((3, 4), plain.int32)
     row = array[0]
-    with pytest.raises(ValueError, match="writing to a view is not there without NumPy"):
+    with pytest.raises(ValueError, match="writing to a view is not supported without NumPy"):
         row[0] = 1
     array[0, 0] = 1
     assert array.tolist()[0] == [1, 0, 0, 0]
     with pytest.raises(TypeError):  # in NumPy every view of the array would see it
         array += 1
-    with pytest.raises(ValueError, match="view of an array that was written to is not there without NumPy"):
+    with pytest.raises(
+        ValueError, match="view of an array that was written to is not supported without NumPy"
+    ):
         row.tolist()
     with pytest.raises(ValueError, match="writing to a view"):
         plain.broadcast_to(array, (2, 3, 4))[0, 0, 0] = 1

@@ -118,7 +118,7 @@ def test_what_does_not_fit_is_refused(tmp_path, monkeypatch):
     for words, message in [
         (["sand-pushing", "--out", "e.wasm", "--env"], "--env, writes a .h file"),
         (["life", "--out", "e.h"], "--env, writes a .h file"),
-        (["--env", "sand-pushing", "--out", "e.h", "--size", "8"], "--size goes with rules"),
+        (["--env", "sand-pushing", "--out", "e.h", "--size", "8"], "--size is for rules"),
         (["--env", "nothing-such", "--out", "e.h"], "nothing-such"),
     ]:
         assert message in powderdsl("export", *words, exits=2).stderr

@@ -295,7 +295,7 @@ def test_rules_that_a_task_does_not_fit_are_refused(mixed: Path) -> None:
     assert "note: worlds of the split have the rules " in checked
     place.write_text(MIXED.replace("p2.yaml]", "p9.yaml]"), encoding="utf-8")
     env = environment(place, 3, backend="wasm")
-    with pytest.raises(ValueError, match=r"observations or actions are others under .*p9"):
+    with pytest.raises(ValueError, match=r"observations or actions differ under .*p9"):
         env.reset(seed=0)
     assert env.episodes is None
 

@@ -116,7 +116,7 @@ def test_seeds_that_make_too_many_combinations_are_refused() -> None:
 
 @pytest.mark.parametrize("text", ["0/2", "3/2", "1", "1/0", "a/b", "1/2/3", "-1/2", "1/99999999", ""])
 def test_an_invalid_shard_is_refused(text: str, steps_run: list[str]) -> None:
-    assert "is not a part: write 1/4" in powderdsl("study", "study.yaml", "--shard", text, exits=2).stderr
+    assert "is not a shard: write 1/4" in powderdsl("study", "study.yaml", "--shard", text, exits=2).stderr
     assert steps_run == []
 
 

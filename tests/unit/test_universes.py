@@ -124,7 +124,7 @@ def test_universes_are_named_like_packs() -> None:
     assert powderdsl.load("wind+universe:7").packs == ("core", "wind", "universe_7")
     assert powderdsl.load("universe:07").packs == ("core", "universe_7")
     (error,) = refusal(powderdsl.load, "universe:7-acid")
-    assert error.message == "`acid` is left out, but it was not there"
+    assert error.message == "`acid` is left out, but no pack loads it"
 
 
 def test_files_name_universes(tmp_path: Path) -> None:

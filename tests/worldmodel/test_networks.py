@@ -207,7 +207,7 @@ def test_a_run_of_the_u_net_has_no_name_and_hostile_names_are_text(dunes: str) -
     assert "network" not in json.loads(Path("run/run.json").read_text())["config"]
     result = run("wm", "eval", "run", "--network", "nets:Wide", "--backend", "torch", exits=2)
     assert "it was trained with the paper's U-net, not with `nets:Wide`" in result.output
-    assert "--width is that of the U-net" in run(*words, "--network", "nets:Wide").output
+    assert "--width is for the U-net" in run(*words, "--network", "nets:Wide").output
     about = json.loads(Path("run/run.json").read_text())
     for name in ("nets:Wide", 3, ["nets:Wide"], "nets", "os:system('x')", "a" * 5000 + ":b"):
         about["config"]["network"] = name

@@ -205,7 +205,7 @@ def test_a_network_is_tested_on_another_recording_of_the_task(copy: Path) -> Non
         (("train", "--data", "ids", "sand-pushing"), "does not fit the task sand-pushing"),
         (("train", "--data", "ids", "builders.yaml", "--worlds", 10), "--worlds selects worlds"),
         (("train", "--data", "ids", "--held-out", "sand"), "--held-out selects worlds"),
-        (("train", "--ignore-actions"), "--ignore-actions goes with --data"),
+        (("train", "--ignore-actions"), "--ignore-actions requires --data"),
         (("eval", "run", "--split", "train"), "--split selects worlds"),
         (("eval", "run", "--worlds", "3"), "--worlds selects worlds"),
         (("show", "run", "--out", "a.png", "--steps", "4"), "--steps selects worlds"),

@@ -40,7 +40,7 @@ def command(
 ) -> None:
     """Print the output of a compiler stage."""
     if after is not None and stage != "schedule":
-        raise BadInput("--after goes with --emit schedule")
+        raise BadInput("--after requires --emit schedule")
     if stage == "tree":
         reporter = Reporter()
         packs, _ = read([rules], reporter)
@@ -110,7 +110,7 @@ def _kernels(program: Program, backend: str, pass_name: str | None) -> Iterator[
     if backend == "reference":
         raise BadInput("the reference backend runs the checked model: it has no kernels")
     if backend in ("native", "cuda") and pass_name is not None:
-        raise BadInput(f"{backend} source is one text: --pass does not go with it")
+        raise BadInput(f"{backend} source is one text: --pass cannot be used with it")
     if backend == "torch-cells":
         yield kernel_source(program, pass_name)
         return

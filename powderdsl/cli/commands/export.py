@@ -51,7 +51,7 @@ def command(
         raise BadInput(f"{out}: --env, and only --env, writes a .h file")
     if as_env:
         if size is not None:
-            raise BadInput("--size goes with rules: a task has its own")
+            raise BadInput("--size is for rules: a task has its own size")
         from powderdsl.envs.header import c_environment
         from powderdsl.envs.mixed import environment
 

@@ -71,7 +71,7 @@ def command(
     values = {"TASK": task, "--out": out, "--episodes": episodes}
     arguments = [*others, *(name for name, value in values.items() if value is not None)]
     if extra := [name for name in arguments if name not in needs]:
-        raise BadInput(f"{mode} does not go with {', '.join(extra)}")
+        raise BadInput(f"{mode} cannot be used with {', '.join(extra)}")
     if missing := [name for name in needs if name not in arguments]:
         raise BadInput(f"missing {', '.join(missing)}")
     from powderdsl.datasets.dataset import Dataset

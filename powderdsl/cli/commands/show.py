@@ -61,7 +61,7 @@ def command(
             click.echo(f"wrote {out}: worlds 0 to {worlds - 1} of {split}", err=as_json)
         return
     if out is not None or knobs or cost:
-        raise BadInput("--out, --knob and --cost go with a task")
+        raise BadInput("--out, --knob and --cost require a task")
     _show(*_of_rules(opt.load_rules(rules, settings)), as_json)
 
 

@@ -106,7 +106,7 @@ def _shard(text: str) -> tuple[int, int]:
     match = re.fullmatch(r"([0-9]{1,7})/([0-9]{1,7})", text)
     number, of = (int(match[1]), int(match[2])) if match else (0, 0)
     if not 1 <= number <= of <= MAX_SHARDS:
-        raise ValueError("is not a part: write 1/4 to 4/4 for four parts")
+        raise ValueError("is not a shard: write 1/4 to 4/4 for four shards")
     return number, of
 
 
@@ -474,7 +474,7 @@ def _check_evaluation(values: Mapping[str, Any], run: TrainConfig | None) -> Non
         if not isinstance(task, Task):
             return
     elif values["knobs"] or values["settings"]:
-        raise BadInput("--knob and --set go with a task: a run has its own")
+        raise BadInput("--knob and --set require a task: a run has its own values")
     else:
         task = _task(run.task, run.knobs, run.params, (*run.packs, *values["packs"]))
     for split in values["splits"] or ():

@@ -39,7 +39,7 @@ def command(task: str | None, folder: Path | None, resume: Path | None, as_json:
     """
     if resume is not None:
         if task is not None or folder is not None:
-            raise BadInput("--resume goes without TASK and --run: the run knows its task")
+            raise BadInput("--resume cannot be used with TASK or --run: the run has its own task")
         config, folder = _continued(resume, values)
     else:
         config = new_config({**values, "task": task})
@@ -71,7 +71,7 @@ def new_config(values: Mapping[str, Any]) -> TrainConfig:
     """The settings of a new run, from options. Raises CompileError and BadInput for invalid ones."""
     task = values["task"]
     if task is None:
-        raise BadInput("say which TASK, or --resume DIR")
+        raise BadInput("pass TASK or --resume DIR")
     settings = opt.given_settings(values, TrainConfig, (*WHAT, "task"))
     if "init_from" in settings:
         settings["init_from"] = str(settings["init_from"].absolute())
@@ -90,7 +90,7 @@ def _continued(folder: Path, values: Mapping[str, Any]) -> tuple[TrainConfig, Pa
 
     settings = opt.given_settings(values, TrainConfig, WHAT)
     if any(name not in HOW for name in settings) or opt.given_options(values, WHAT):
-        raise BadInput(f"--resume keeps what is trained; only {', '.join(HOW)} may change")
+        raise BadInput(f"--resume continues the same training; only {', '.join(HOW)} may change")
     run = find_run(folder, KIND)
     latest = read_json(run.path / ASKED) or {}
     how = {name: latest[name] for name in HOW if name in latest}

@@ -99,10 +99,10 @@ def train_command(folder: Path | None, ignore_actions: bool, **values: Any) -> N
     is the same as without the stop.
     """
     if values["network_name"] and values["width"]:
-        raise BadInput("--width is that of the U-net: leave it out with --network")
+        raise BadInput("--width is for the U-net: omit it with --network")
     if values["data"] is None:
         if ignore_actions:
-            raise BadInput("--ignore-actions goes with --data")
+            raise BadInput("--ignore-actions requires --data")
         config = new_config(values, rules_of)
         _run(config, folder or Path("runs") / (Path(config.data.task).stem or "run"), values)
         return
@@ -125,7 +125,7 @@ def new_config(values: Mapping[str, Any], rules_of: Callable[..., str]) -> Train
     """
     packs, held_out = values["packs"], values["held_out"]
     if packs and held_out:
-        raise BadInput("--packs says what stays, --held-out what goes: give one of them")
+        raise BadInput("--packs and --held-out cannot be combined")
     with user_values():
         config = replace(PRESETS[values["preset"]], **opt.given_settings(values, TrainConfig))
         rules, task = values["rules"] or "", values["task"] or config.data.task

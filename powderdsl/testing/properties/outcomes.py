@@ -357,7 +357,7 @@ def read_start(tree: Tree, ruleset: Ruleset) -> Start:
     assert isinstance(params, dict)
     planes = {name: read_array(rows, types[name]) for name, rows in fields.items()}
     if any((len(values), *values.shape[-2:]) != ids.shape for values in planes.values()):
-        raise ValueError("a field of another size than the world")
+        raise ValueError("a field whose size differs from the world's")
     known = {param.name for param in ruleset.params}
     numbers = {name: read_array(row, "float64") for name, row in params.items() if name in known}
     seed, step = int(line_of(tree["seed"])), int(line_of(tree["step"]))
