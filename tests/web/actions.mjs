@@ -1,12 +1,14 @@
-// Random actions over every control, and reloads that must lose nothing: node actions.mjs ADDRESS [COUNT [SEED]]
+// Random actions over every control, and reloads that must lose nothing: node actions.mjs ADDRESS [COUNT [SEED [SLOWER]]]
 import { launch, linkToLife, openPage, tools } from "./browser.mjs";
 
-const [address, number = "500", seed = "1"] = process.argv.slice(2);
+const [address, number = "500", seed = "1", slower = "1"] = process.argv.slice(2);
 const count = Number(number);
 const browser = await launch();
 const context = await browser.newContext({ viewport: { width: 1440, height: 900 } });
 const { page, problems } = await openPage(context, address, { before: prepare });
-const { settled } = tools(page);
+await (await context.newCDPSession(page)).send("Emulation.setCPUThrottlingRate", { rate: Number(slower) });
+page.on("console", (message) => /^powderdsl: /.test(message.text()) && problems.push(message.text())); // nothing is kept, or nothing comes back
+const { until } = tools(page);
 const seen = { actions: 0, kinds: {}, reloads: 0, lost: [], heap: [], last: [] };
 
 /** Puts a function into the page that does something at random. */
@@ -84,6 +86,7 @@ function prepare() {
     if (visited() && below(2)) {
       sessionStorage.setItem("visited", String(visited() - 1));
       history.back();
+      return new Promise((resolve) => addEventListener("popstate", () => resolve("visit"), { once: true }));
     } else if (location.hash !== globalThis.link) {
       sessionStorage.setItem("visited", String(visited() + 1));
       location.hash = globalThis.link;
@@ -91,12 +94,25 @@ function prepare() {
   };
   const DEEDS = { use, stroke, press: () => press(one(KEYS)), write, mend, drop, visit };
   const CHANCES = ["use", "use", "use", "use", "use", "use", "stroke", "stroke", "stroke", "press", "press", "write", "mend", "drop", "visit"];
-  globalThis.deed = (begin) => {
+  globalThis.deed = async (begin) => {
     state = begin;
     const name = one(CHANCES);
     if (["write", "mend", "drop", "visit"].includes(name) && !powderdsl.linkOpened) return "nothing";
-    const done = DEEDS[name]();
-    return typeof done === "string" ? done : name;
+    return (await DEEDS[name]()) || name;
+  };
+  // Requests, swaps, checks and the acts of tasks go on after an action: nothing of them for a second means that it is over.
+  const { fetch } = globalThis;
+  let [requests, last, since] = [0, "", 0];
+  globalThis.fetch = (...asked) => {
+    requests++;
+    return fetch(...asked).finally(() => requests--);
+  };
+  globalThis.isOver = () => {
+    const { compilerReady, edits, engine, running, swapping, work } = powderdsl;
+    const isChecked = !edits || edits.checkTook !== null || !compilerReady;
+    const now = !requests && !swapping && isChecked && history.state?.work === work && `${running || engine.clock()} ${work}`;
+    if (now !== last) [last, since] = [now, performance.now()];
+    return now && performance.now() - since > 1000;
   };
   globalThis.whole = () => {
     const { edits, element, engine, named, opened, rules, start } = powderdsl;
@@ -117,7 +133,7 @@ while (seen.actions < count && !seen.lost.length && !problems.length) {
   for (let n = 0; n < sitting; n++) {
     state = (Math.imul(state, 22695477) + 1) >>> 0;
     const done = await page.evaluate(async (begin) => {
-      const kind = deed(begin);
+      const kind = await deed(begin);
       await new Promise((resolve) => setTimeout(resolve, begin % 30));
       return kind;
     }, state);
@@ -127,9 +143,7 @@ while (seen.actions < count && !seen.lost.length && !problems.length) {
     seen.kinds[kind] = (seen.kinds[kind] ?? 0) + 1;
     if (problems.length) break;
   }
-  await settled();
-  await page.waitForTimeout(400); // typing is checked, and lands
-  await page.waitForFunction(() => !powderdsl.swapping && (!powderdsl.edits || powderdsl.edits.checkTook !== null || !powderdsl.compilerReady), null, { timeout: 60000 });
+  await until(() => isOver());
   const before = await page.evaluate(() => {
     if (powderdsl.running) document.getElementById("run").click();
     gc();

@@ -93,7 +93,8 @@ def test_work_is_kept(address: str, tmp_path: Path) -> None:
     assert "is back" in found["back"]
     assert found["link"][1] == "life"
     assert "Your earlier work is under Recent." in found["link"][0]
-    assert (found["wentBack"], found["fromList"], found["undoneLink"]) == (True, True, "life")
+    assert (found["wentBack"], found["changed"]) == (True, True)
+    assert (found["fromList"], found["undoneLink"]) == (True, "life")
     assert "powderworld, sand.yaml" in found["recent"]
     assert "is back" in found["newTab"]
 

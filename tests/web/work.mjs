@@ -55,6 +55,11 @@ await page.screenshot({ path: join(folder, "link.png") });
 await page.goBack();
 await said("status", /This is your earlier work/);
 seen.wentBack = await same();
+// It comes back where the address has changed since it was kept, too: the page was ended before it could keep that.
+await page.evaluate(() => [(powderdsl.save = null), history.replaceState(history.state, "", "#changed")]);
+await page.reload();
+await ready();
+seen.changed = await same();
 await page.goForward();
 await until(() => powderdsl.rules.key === "life");
 await page.locator("#recent summary").click();

@@ -204,7 +204,8 @@ addEventListener("drop", (event) => {
   event.preventDefault();
   openAll([...(event.dataTransfer?.files ?? [])]).catch(failed);
 });
-addEventListener("hashchange", () => history.state?.work || openLink(location.hash).catch(failed));
+// Not hashchange: that comes later, when the present work may have been kept as that of the link.
+addEventListener("popstate", ({ state }) => state?.work || openLink(location.hash).catch(failed));
 (app.isBack && !location.hash.startsWith("#task=") ? Promise.resolve() : openLink(location.hash))
   .catch(failed)
   .finally(() => (app.linkOpened = true));

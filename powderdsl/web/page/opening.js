@@ -155,8 +155,8 @@ export function openWork(found, { words, run = false, work } = {}) {
     if (!sheet) throw new Error(`This page does not have the rules ${key}.`);
     const edited = files !== null || String(off) !== String(sheet.off);
     const own = { files: files ?? sheet.files, off };
-    const isShipped = !edited && hasModule(key, rows, columns);
-    const good = found.good ?? own;
+    const good = found.good ?? own; // files with mistakes may run as those of the site
+    const isShipped = hasModule(key, rows, columns) && JSON.stringify([good.files, good.off]) === JSON.stringify([sheet.files, sheet.off]);
     let module = found.module ?? (isShipped ? await shippedModule(key, rows, columns) : null);
     if (!module) say("Compiling the rules…");
     module ??= await (await import("./rules.js")).compile(good, rows, columns);
@@ -175,6 +175,6 @@ export function openWork(found, { words, run = false, work } = {}) {
       else say("The rules have mistakes: see the list below the editor.", true);
     };
   });
-  opened.catch(() => false).then((landed) => landed || app.edits?.recheck());
+  opened.catch(() => false).then((landed) => landed || (app.engine && app.edits?.recheck()));
   return opened;
 }

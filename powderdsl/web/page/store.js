@@ -102,7 +102,9 @@ export async function restore() {
   base = await answer(asked);
   app.save = save;
   const heads = (await answer(read("heads").getAll())).sort((a, b) => b.when - a.when);
-  let head = heads.find((one) => one.id === sessionStorage.getItem("work") && one.place === place());
+  // The address may have changed since it was kept, so the entry of the history says what it showed.
+  const id = history.state?.work;
+  let head = heads.find((one) => (id ? one.id === id : one.id === sessionStorage.getItem("work") && one.place === place()));
   const words = `Your work of ${time(head ?? heads[0])} is back.`;
   if (!head && !place() && heads[0]?.isWork && !heads[0].open && heads[0].first === app.catalog.rules[0].key) {
     const { key, sheet } = await answer(read("works").get(heads[0].id));
@@ -158,5 +160,5 @@ setInterval(() => {
 for (const name of ["beforeunload", "pagehide"]) addEventListener(name, () => now(false));
 addEventListener("pageshow", ({ persisted }) => persisted && now());
 addEventListener("popstate", ({ state }) => {
-  if (state?.work && state.work !== app.work && base) openKept({ id: state.work }, { words: "This is your earlier work, paused." }).catch(failed);
+  if (state?.work && state.work !== app.work && base) openKept({ id: state.work }, { words: "This is your earlier work, paused." }).then((landed) => landed || (app.unsaved = true), failed);
 });

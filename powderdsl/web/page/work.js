@@ -17,17 +17,20 @@ import { app } from "./state.js";
 export const UNIVERSE = "universe…";
 
 let newest = 0;
+let supersede = () => {};
 
 /**
  * Puts another engine in place: `prepare` resolves to a function that does it at once. What began before a newer swap
- * never lands, and its failure interests nobody. Resolves to whether it has landed.
+ * never lands, nobody waits for it, and its failure interests nobody. Resolves to whether it has landed.
  * @param {() => Promise<() => void>} prepare
  */
 export function swap(prepare) {
   const mine = ++newest;
+  supersede();
+  const superseded = new Promise((resolve) => (supersede = resolve));
   const run = async () => {
     try {
-      const land = await prepare();
+      const land = await Promise.race([prepare(), superseded]);
       if (mine !== newest) return false;
       land();
       return true;
