@@ -3,6 +3,7 @@ import { cpSync, existsSync, mkdirSync, readFileSync, rmSync, writeFileSync } fr
 import { dirname, join } from "node:path";
 import { fileURLToPath } from "node:url";
 import { build } from "esbuild";
+import { loadPyodide } from "pyodide";
 
 const here = dirname(fileURLToPath(import.meta.url));
 const modules = join(here, "node_modules");
@@ -33,9 +34,10 @@ for (const name of ["pyodide", ...EDITOR]) {
 const { version } = JSON.parse(readFileSync(join(modules, "pyodide", "package.json"), "utf8"));
 const { python } = JSON.parse(readFileSync(join(modules, "pyodide", "pyodide-lock.json"), "utf8")).info;
 const NOTES = {
-  pyodide: `Pyodide ${version}, Copyright Pyodide contributors and Mozilla. Unchanged files of its npm package.
+  pyodide: `Pyodide ${version}, Copyright Pyodide contributors and Mozilla. Files of its npm package.
 Its source is at https://github.com/pyodide/pyodide/tree/${version}, under this license:`,
-  python: `Python ${python}, which is a part of Pyodide: its interpreter and its standard library.
+  python: `Python ${python}, which is a part of Pyodide: its interpreter and most of its standard library,
+in part compiled.
 What else it contains is listed, with licenses, at https://docs.python.org/${python.split(".", 2).join(".")}/license.html.`,
 };
 for (const [name, note] of Object.entries(NOTES)) {
@@ -57,4 +59,24 @@ await build({
 
 versions.splice(1, 0, `python ${python}, PSF-2.0`);
 for (const file of PYODIDE) cpSync(join(modules, "pyodide", file), join(parts, "pyodide", file));
+// Modules that are imported at the start are compiled here, which took the page two seconds, and tools are left out.
+const library = join(parts, "pyodide", "python_stdlib.zip");
+const pyodide = await loadPyodide();
+pyodide.FS.writeFile("/given.zip", readFileSync(library));
+pyodide.runPython(`
+import importlib._bootstrap_external, re, sys, zipfile
+import datetime, difflib, fractions, graphlib, pickle, secrets  # for powderdsl
+files = [getattr(module, "__file__", None) or "" for module in list(sys.modules.values())]
+imported = {file.rpartition(".zip/")[2] for file in files if ".zip/" in file}
+tools = re.compile(r"(_pyrepl|doctest|multiprocessing|pdb|pydoc|unittest|wsgiref|xmlrpc)\\b")
+with zipfile.ZipFile("/given.zip") as given, zipfile.ZipFile("/made.zip", "w", compresslevel=9) as made:
+    for name in given.namelist():
+        data = given.read(name)
+        if name in imported:
+            code = compile(data, name, "exec", dont_inherit=True, optimize=2)
+            name, data = f"{name}c", importlib._bootstrap_external._code_to_timestamp_pyc(code)
+        if not tools.match(name):
+            made.writestr(zipfile.ZipInfo(name, (2000, 1, 1, 0, 0, 0)), data, zipfile.ZIP_DEFLATED)
+`);
+writeFileSync(library, pyodide.FS.readFile("/made.zip"));
 writeFileSync(join(parts, "licenses", "README.txt"), `${versions.join("\n")}\n`);

@@ -76,6 +76,8 @@ def test_a_second_visit_needs_no_network(folder: Path) -> None:
     # The browser itself asks whether there is a new service worker.
     assert set(found["second"]["paths"]) <= {"/sw.js"}
     assert found["offline"]["ready"] > 0
+    # The memory of the started compiler is kept.
+    assert [found[visit]["isKept"] for visit in ("first", "second", "offline")] == [False, True, True]
     # A new version replaces the old one at the next visit, and only its files are kept.
     assert found["replaced"] == {"texts": ["old", "new"], "caches": 1}
     assert found["problems"] == []

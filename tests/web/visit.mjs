@@ -64,10 +64,11 @@ async function visit(name, { throttled = false, page: path = "play.html" } = {})
   await page.goto(address + path, { timeout: 120_000 });
   await page.waitForFunction(() => globalThis.powderdsl?.compilerReady, null, { timeout: 120_000 });
   const [picture, ready] = await page.evaluate(() => [powderdsl.firstPicture, powderdsl.compilerReady]);
+  const isKept = await page.workers()[0].evaluate(() => Boolean(python._api.config._loadSnapshot));
   const untilReady = sent() - bytes;
   await worker(page, "active", "activated");
   await page.waitForTimeout(500);
-  const found = { picture: Math.round(picture), ready: Math.round(ready), untilReady, bytes: sent() - bytes, paths: asked.slice(requests) };
+  const found = { picture: Math.round(picture), ready: Math.round(ready), isKept, untilReady, bytes: sent() - bytes, paths: asked.slice(requests) };
   await page.close();
   return found;
 }
@@ -87,7 +88,7 @@ if (!megabits) {
   await page.reload();
   await page.waitForFunction(() => document.title.startsWith("new"), null, { timeout: 30_000 }).catch(() => {});
   texts.push(await title());
-  seen.replaced = { texts, caches: await page.evaluate(async () => (await caches.keys()).length) };
+  seen.replaced = { texts, caches: await page.evaluate(async () => (await caches.keys()).filter((one) => one.startsWith("powderdsl-")).length) };
   await page.close();
 }
 server.close();

@@ -127,7 +127,6 @@ async function begin() {
   if (!embedded && !app.isBack && !location.hash && !toured()) await import("./tour.js");
   await import("./tasks.js"); // its files are large
   await addWorlds(await (await get("tasks.json")).json());
-  if (app.catalog.offline) navigator.serviceWorker?.register("sw.js").catch(() => {}); // private windows may refuse
 }
 
 globalThis.powderdsl = app; // for tests and for people who look at the page's console

@@ -115,6 +115,9 @@ const LIMITS = { universe: 60_000, invariants: 60_000, tests: 60_000, trace: 60_
 export const compiler = new Compiler((stage, error) => {
   $("compiler").textContent = `Compiler: ${stage}`;
   $("compiler").className = stage === "failed" ? "bad" : "";
-  if (stage === "ready" && !app.compilerReady) app.compilerReady = performance.now();
+  if (stage === "ready" && !app.compilerReady) {
+    app.compilerReady = performance.now();
+    if (app.catalog.offline) navigator.serviceWorker?.register("sw.js").catch(() => {}); // private windows may refuse
+  }
   if (error) say(error, true);
 });
