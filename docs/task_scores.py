@@ -14,7 +14,8 @@ from torch import Tensor
 
 from powderdsl.tasks.episodes import Episodes, TaskProgram, compile_task
 from powderdsl.tasks.players import ExpertPlayer
-from powderdsl.web.playable import WORLDS, playable
+from powderdsl.tasks.shipped import load_task
+from powderdsl.web.playable import WORLDS, playable, played_split
 from powderdsl.web.site import PAGE
 
 PLAYS = 16
@@ -36,8 +37,13 @@ def returns(program: TaskProgram, worlds: Tensor, player: Player) -> Tensor:
 
 def scores(name: str) -> dict[str, list[float]]:
     """The returns of a task in its worlds, by player."""
-    program = compile_task(name)
-    worlds = torch.arange(WORLDS)
+    program = compile_task(name, split=played_split(load_task(name)).name)
+    parts = [_scores(one, places) for places, one in program.apart(torch.arange(WORLDS))]
+    return {player: [value for part in parts for value in part[player]] for player in parts[0]}
+
+
+def _scores(program: TaskProgram, worlds: Tensor) -> dict[str, list[float]]:
+    """The same, of worlds under the same rules."""
     draws = torch.Generator().manual_seed(0)
     nvec = torch.tensor(program.action_nvec)
 

@@ -37,7 +37,6 @@ MAX_TEXT = 1 << 20
 NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_-]{0,60}\.ya?ml")
 PACK = re.compile(r"[A-Za-z_][A-Za-z0-9_]{0,60}")
 
-
 PROOF = 10.0
 """Seconds of counted work for proofs: a third of the time that the page waits."""
 

@@ -12,14 +12,15 @@ from powderdsl.model.state import qualified_slots
 from powderdsl.model.types import Expr
 from powderdsl.syntax.sources import shipped
 from powderdsl.targets.array_kind import ArrayKind
+from powderdsl.tasks.file import task_under
 from powderdsl.tasks.goals import REGION_LET, parts_of
 from powderdsl.tasks.shipped import load_task, shipped_tasks
-from powderdsl.tasks.task import BLOW, NO_CHANGE, Measure, Task
+from powderdsl.tasks.task import BLOW, NO_CHANGE, Measure, Split, Task
 from powderdsl.tasks.tensors.generator import StartWorlds
 from powderdsl.worlds.store import world_data
 
 WORLDS = 8
-"""Number of start worlds of a task in the page: the first ones of its first split."""
+"""Number of start worlds of a task in the page: the first ones of `played_split`."""
 
 _KNOWN = {"element", "member", "let", "and", "or", "not", "const"}
 """Operations on cells that depend only on their element."""
@@ -27,13 +28,18 @@ _KNOWN = {"element", "member", "let", "and", "or", "not", "const"}
 
 @cache
 def playable() -> tuple[str, ...]:
-    """The shipped tasks with a goal that depends on counts of elements, under rules that all worlds share."""
+    """The shipped tasks with a goal that depends on counts of elements, under rules that the page has or makes."""
     return tuple(name for name in shipped_tasks() if _is_playable(load_task(name)))
 
 
+def played_split(task: Task) -> Split:
+    """The split of the worlds in the page: of tasks whose rules differ by world, rules that training does not show."""
+    return task.split("test") if task.splits[0].rulesets else task.splits[0]
+
+
 def _is_playable(task: Task) -> bool:
-    split, values = task.splits[0], [measure.value for measure in _measures(task)]
-    alike = not split.rulesets and not split.params and len(task.rules) == 1
+    split, values = played_split(task), [measure.value for measure in _measures(task)]
+    alike = not split.params and all(len(rules) == 1 for rules in (task.rules, *split.rulesets))
     known = all(value is not None and {part.op for part in value.walk()} <= _KNOWN for value in values)
     return alike and known and (task.goal.each is not None or task.goal.final is not None)
 
@@ -49,41 +55,42 @@ def _measures(task: Task) -> list[Measure]:
 
 
 def task_data(name: str) -> dict[str, Any]:
-    """A task for the page: expressions are lists of an operation and its arguments."""
-    task, rules = load_task(name), load_task(name).ruleset
-    made = StartWorlds(task, task.splits[0].name, ArrayKind()).make(np.arange(WORLDS, dtype=np.int64))
-    agent, measures = task.agent, _measures(task)
-    counted = [_counted(measure, [element.id for element in rules.elements]) for measure in measures]
-    names = {element.id: element.qualified for element in rules.elements}
-    names |= {BLOW: "blow", NO_CHANGE: "nothing"}
+    """A task for the page: expressions are lists of an operation and its arguments.
+
+    Each of `starts` has its rules and what depends on them, such as the ids of elements.
+    """
+    task = load_task(name)
+    agent, split = task.agent, played_split(task)
     text = (shipped("tasks") / f"{name}.yaml").read_text(encoding="utf-8")
     lines = re.findall(r"^  ((?:each|final|success|failure): (?:.|\n    )*)$", text, re.MULTILINE)
-    starts = []
-    for number in range(WORLDS):
-        fields = {key: np.asarray(values)[number] for key, (values, _) in made.fields.items()}
-        world = world_data(rules, np.asarray(made.ids)[number], fields, (number, 0, 0))
-        regions = {}
-        for region in sorted({one[key] for one in counted for key in ("region", "let") if one[key]}):
-            cells = np.asarray(made.regions[region])
-            octets = cells[number % len(cells)].astype("uint8").tobytes()
-            regions[region] = base64.b64encode(octets).decode()
-        starts.append({"world": world, "regions": regions})
+    tasks = [task_under(task, rules) for rules in split.rulesets[:WORLDS]] or [task] * WORLDS
     return {
         "name": task.name,
         "about": task.about,
-        "rules": task.rules[0],
         "lines": [" ".join(line.split()).replace(">- ", "") for line in lines],
-        "choices": [names[choice] for choice in agent.choices],
-        "brush": agent.brush,
-        "bins": agent.bins,
-        "actions": agent.actions,
+        **{key: getattr(agent, key) for key in ("brush", "bins", "actions", "speed")},
         "steps": agent.steps_per_action,
         "free": agent.free_steps,
-        "speed": agent.speed,
-        "field": qualified_slots(rules).get(agent.speed_field or ""),
-        "goal": {key: _written(scalar, measures) for key, scalar in _goal(task).items()},
+        "goal": {key: _written(scalar, _measures(task)) for key, scalar in _goal(task).items()},
+        "starts": [_start(task, split.name, number) for number, task in enumerate(tasks)],
+    }
+
+
+def _start(task: Task, split: str, number: int) -> dict[str, Any]:
+    """A start world, and what depends on its rules."""
+    rules, made = task.ruleset, StartWorlds(task, split, ArrayKind()).make(np.array([number], np.int64))
+    counted = [_counted(measure, [element.id for element in rules.elements]) for measure in _measures(task)]
+    names = {one.id: one.qualified for one in rules.elements} | {BLOW: "blow", NO_CHANGE: "nothing"}
+    fields = {key: np.asarray(values)[0] for key, (values, _) in made.fields.items()}
+    regions = {one[key] for one in counted for key in ("region", "let")} - {None}
+    cells = {key: np.asarray(made.regions[key])[0].astype("uint8") for key in sorted(regions)}
+    return {
+        "rules": task.rules[0].replace(":", "_"),
+        "choices": [names[choice] for choice in task.agent.choices],
+        "field": qualified_slots(rules).get(task.agent.speed_field or ""),
         "measures": counted,
-        "starts": starts,
+        "world": world_data(rules, np.asarray(made.ids)[0], fields, (number, 0, 0)),
+        "regions": {key: base64.b64encode(values.tobytes()).decode() for key, values in cells.items()},
     }
 
 

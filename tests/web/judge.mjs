@@ -1,4 +1,4 @@
-// Plays tasks: node judge.mjs JUDGE FOLDER, which holds NAME.json, NAME.wasm and actions.json; prints the returns.
+// Plays tasks: node judge.mjs JUDGE FOLDER, which holds NAME.json, RULES-SIZE.wasm and actions.json; prints the returns.
 import { readFileSync } from "node:fs";
 import { join } from "node:path";
 
@@ -9,11 +9,13 @@ const modules = {};
 const seen = {};
 for (const [name, worlds] of Object.entries(given)) {
   const task = JSON.parse(readFileSync(join(folder, `${name}.json`)));
-  modules[task.rules] ??= await WebAssembly.compile(readFileSync(join(folder, `${task.rules}.wasm`)));
   seen[name] = [];
   for (const [number, actions] of worlds.entries()) {
-    const judge = await Judge.start(task, number, modules[task.rules]);
-    for (const one of read(written(actions), task)) if (!judge.over) [...judge.act(one)];
+    const { rules, world } = task.starts[number];
+    const file = `${rules}-${world.rows}x${world.columns}.wasm`;
+    modules[file] ??= await WebAssembly.compile(readFileSync(join(folder, file)));
+    const judge = await Judge.start(task, number, modules[file]);
+    for (const one of read(written(actions), judge.task)) if (!judge.over) [...judge.act(one)];
     seen[name].push([judge.total, judge.success, judge.actions.length]);
   }
 }

@@ -12,7 +12,8 @@ import torch
 from powderdsl.compiler import load
 from powderdsl.simulation.standalone import standalone_module
 from powderdsl.tasks.episodes import compile_task
-from powderdsl.web.playable import WORLDS, playable, task_data
+from powderdsl.tasks.shipped import load_task
+from powderdsl.web.playable import WORLDS, playable, played_split, task_data
 from powderdsl.web.site import PAGE
 from tests.tiers import tiered
 from tests.wheels import succeed
@@ -23,22 +24,22 @@ SCORES = json.loads((PAGE / "scores.json").read_text(encoding="utf-8"))
 
 def played(name: str, seed: int) -> tuple[list[list[list[int]]], list[list[float]]]:
     """Random actions in two worlds of a task, as links have them, and their returns, successes and counts."""
-    program = compile_task(name)
+    program = compile_task(name, split=played_split(load_task(name)).name)
     draws = torch.Generator().manual_seed(seed)
     nvec = torch.tensor(program.action_nvec)
-    episodes = program.start(torch.arange(2))
-    actions: list[list[list[int]]] = [[], []]
-    results = [[0.0, False, 0], [0.0, False, 0]]
-    going = torch.ones(2, dtype=torch.bool)
-    while bool(going.any()):
-        taken = (torch.rand(2, 5, generator=draws) * nvec).long()
-        episodes, reward, success, over = program.act(episodes, taken)
-        for world in going.nonzero()[:, 0].tolist():
-            x, y, choice, vx, vy = taken[world].tolist()
-            actions[world].append([x, y, choice, 3 * vy + vx])
-            total, _, count = results[world]
-            results[world] = [total + float(reward[world]), bool(success[world]), count + 1]
-        going &= ~over
+    actions: list[list[list[int]]] = []
+    results: list[list[float]] = []
+    for world in range(2):
+        own, taken, total = program.under(world), [], 0.0
+        episodes, over = own.start(torch.tensor([world])), torch.zeros(1, dtype=torch.bool)
+        while not over:
+            action = (torch.rand(1, 5, generator=draws) * nvec).long()
+            episodes, reward, success, over = own.act(episodes, action)
+            x, y, choice, vx, vy = action[0].tolist()
+            taken.append([x, y, choice, 3 * vy + vx])
+            total += float(reward)
+        actions.append(taken)
+        results.append([total, bool(success), len(taken)])
     return actions, results
 
 
@@ -60,8 +61,8 @@ def test_the_scores_are_what_doing_nothing_returns(name: str) -> None:
 @pytest.mark.parametrize(
     "names",
     tiered(
-        [("herd-gas", "stone-tower", "blow-up-the-heap"), playable()],
-        [("herd-gas", "stone-tower", "blow-up-the-heap")],
+        [("herd-gas", "stone-tower", "blow-up-the-heap", "aim-with-the-wind"), playable()],
+        [("herd-gas", "stone-tower", "blow-up-the-heap", "aim-with-the-wind")],
     ),
 )
 def test_the_page_judges_as_tasks_do(names: tuple[str, ...], tmp_path: Path) -> None:
@@ -72,9 +73,12 @@ def test_the_page_judges_as_tasks_do(names: tuple[str, ...], tmp_path: Path) -> 
     for number, name in enumerate(names):
         data = task_data(name)
         (tmp_path / f"{name}.json").write_text(json.dumps(data), encoding="utf-8")
-        module = tmp_path / f"{data['rules']}.wasm"
-        if not module.exists():
-            module.write_bytes(standalone_module(load(data["rules"]), (64, 64)))
+        for start in data["starts"][:2]:
+            rules, size = start["rules"], (start["world"]["rows"], start["world"]["columns"])
+            module = tmp_path / f"{rules}-{size[0]}x{size[1]}.wasm"
+            if not module.exists():
+                ruleset = load(rules.replace("universe_", "universe:"))
+                module.write_bytes(standalone_module(ruleset, size))
         actions[name], expected[name] = played(name, number)
     (tmp_path / "actions.json").write_text(json.dumps(actions), encoding="utf-8")
     found = json.loads(succeed(node, HERE / "judge.mjs", PAGE / "judge.js", tmp_path, cwd=tmp_path))

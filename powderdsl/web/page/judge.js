@@ -31,8 +31,9 @@ export class Judge {
   }
 
   constructor(task, number, engine) {
-    Object.assign(this, { task, number, engine });
     const { regions, world } = task.starts[number];
+    // Each world has its rules, and with them its choices and what is counted.
+    Object.assign(this, { task: { ...task, ...task.starts[number] }, number, engine });
     this.regions = Object.fromEntries(Object.entries(regions).map(([name, cells]) => [name, bytes(cells)]));
     engine.restore(readWorld(world));
     this.ids = new Map(engine.elements.map((one) => [one.qualified, one.id]));

@@ -3,7 +3,7 @@
 import { $, failed, fill, get, make, say } from "./dom.js";
 import { Judge, read, written } from "./judge.js";
 import { openRules, openWorld } from "./opening.js";
-import { listedRules, shippedModule } from "./shipped.js";
+import { listedRules, unedited } from "./shipped.js";
 import { isStill, refresh, setRunning } from "./stage.js";
 import { app } from "./state.js";
 import { markStop, showPanel } from "./tabs.js";
@@ -22,7 +22,7 @@ function showList() {
   if (judge && location.hash.startsWith("#task=")) history.replaceState(history.state, "", location.pathname + location.search);
   [judge, app.play] = [null, null];
   outline(null);
-  const rows = Object.entries(listed).flatMap(([key, worlds]) => (listedRules(key) ? worlds : [])).map(({ name, about }) => [name.replace(/^task /, ""), about]);
+  const rows = Object.entries(listed).flatMap(([key, worlds]) => (listedRules(key) || key.startsWith("universe:") ? worlds : [])).map(({ name, about }) => [name.replace(/^task /, ""), about]);
   const buttons = rows.filter(([name]) => name in scores).map(([name, about]) => {
     const open = () => play(name, 0).catch(failed);
     return make("button", { type: "button", class: "wide", onclick: open }, make("strong", {}, name), make("small", {}, about));
@@ -33,15 +33,16 @@ function showList() {
 /** Begins a task. @param {boolean} keeps  whether the world on the page stays as it is */
 async function play(name, number, keeps = false) {
   const task = await json(`tasks/${name}.json`);
-  if (keeps && app.rules.key !== task.rules) return; // other rules were opened since
-  const { rows, columns } = task.starts[number].world;
-  if (app.rules.key !== task.rules) await openRules(task.rules, { run: false });
+  const { rules, world } = task.starts[number];
+  // Other rules may be opened meanwhile.
+  if (app.rules.key !== rules && (keeps || !(await openRules(rules, { run: false })))) return;
   setRunning(false);
-  const begun = await Judge.start(task, number, await shippedModule(task.rules, rows, columns));
+  const begun = await Judge.start(task, number, await unedited(app.rules, world.rows, world.columns));
   if (!keeps) await openWorld(begun.engine.snapshot());
   judge = begun;
-  choice = task.choices.findIndex((one) => one !== "nothing");
-  app.play = { act: (cell) => act([...judge.bin(cell), choice, task.choices[choice] === "blow" ? aim : 4]).catch(failed), mark };
+  const { choices } = begun.task;
+  choice = choices.findIndex((one) => one !== "nothing");
+  app.play = { act: (cell) => act([...judge.bin(cell), choice, choices[choice] === "blow" ? aim : 4]).catch(failed), mark };
   showPanel("tasks");
   showTask();
 }
