@@ -110,7 +110,7 @@ function prepare() {
   globalThis.isOver = () => {
     const { compilerReady, edits, engine, running, swapping, work } = powderdsl;
     const isChecked = !edits || edits.checkTook !== null || !compilerReady;
-    const now = !requests && !swapping && isChecked && history.state?.work === work && `${running || engine.clock()} ${work}`;
+    const now = !requests && !swapping && isChecked && (history.state?.work ?? work) === work && `${running || engine.clock()} ${work}`;
     if (now !== last) [last, since] = [now, performance.now()];
     return now && performance.now() - since > 1000;
   };
