@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from powderdsl.ir.bits import Segment
     from powderdsl.ir.ops import PassGraph, Program
     from powderdsl.model.composition.compose import Palette
+    from powderdsl.model.kept import Kept
 
 BACKENDS = {
     "auto": "`wasm` first, and `native` once it is compiled; `cuda`, or else `torch`, on other devices",
@@ -121,21 +122,24 @@ def load(
 
 @collection_paused()
 def load_with_diagnostics(
-    *names: str | Path, params: Mapping[str, Any] | None = None, palette: Palette | None = None
+    *names: str | Path,
+    params: Mapping[str, Any] | None = None,
+    palette: Palette | None = None,
+    kept: Kept | None = None,
 ) -> tuple[Ruleset, tuple[Diagnostic, ...]]:
-    """Read rule files as `load` does; return the checked model, and its warnings and notes in source order."""
+    """Read as `load` does; return the model, and warnings and notes in source order. `kept` is as in `check`."""
     reporter = Reporter()
     reader = _Reader(reporter)
     packs, ruleset = reader.read_all(names)
     if reporter.has_errors:
         if reader.is_whole and not any(d.code == "PD111" for d in reporter.diagnostics):
-            _report_more(packs, ruleset, reader, palette)
+            _report_more(packs, ruleset, reader, palette=palette, kept=kept)
         reporter.raise_if_errors()
 
     def checked() -> tuple[Ruleset, tuple[Diagnostic, ...]]:
         from powderdsl.model.check import check, demote_outgrown
 
-        model = check(packs, ruleset, reporter, palette, shipped_words)
+        model = check(packs, ruleset, reporter, palette, shipped_words, kept=kept)
         reporter.raise_if_errors()
         return model, demote_outgrown(model, reporter.diagnostics)
 
@@ -172,9 +176,7 @@ CLAIM = "command_line"
 """The name of the pack that contains a claim without a file."""
 
 
-def _report_more(
-    packs: Sequence[PackDecl], ruleset: RulesetDecl | None, reader: _Reader, palette: Palette | None
-) -> None:
+def _report_more(packs: Sequence[PackDecl], ruleset: RulesetDecl | None, reader: _Reader, **how: Any) -> None:
     """Report further mistakes in files, except those that may follow from the mistakes reported so far."""
     from powderdsl.model.check import check
 
@@ -183,7 +185,7 @@ def _report_more(
         lost -= {decl.name.text for section in (*SHARED, "passes") for decl in getattr(pack, section)}
     later = Reporter()
     with suppress(CompileError):
-        check([replace(pack, tests=(), invariants=()) for pack in packs], ruleset, later, palette, alone=True)
+        check([replace(pack, tests=(), invariants=()) for pack in packs], ruleset, later, alone=True, **how)
     for diagnostic in later.diagnostics:
         span = diagnostic.primary.span
         word = span.text.removesuffix("?") if span else ""

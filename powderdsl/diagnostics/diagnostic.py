@@ -236,7 +236,8 @@ class Reporter:
 
     def __init__(self) -> None:
         self._diagnostics: dict[Diagnostic, None] = {}
-        self._errors = 0
+        self._errors = self.reports = 0
+        """`reports` also counts repetitions."""
 
     def report(
         self,
@@ -261,6 +262,7 @@ class Reporter:
 
     def add(self, diagnostic: Diagnostic) -> None:
         """Add a diagnostic. Raises CompileError as `report` does."""
+        self.reports += 1
         if diagnostic in self._diagnostics:
             return
         if diagnostic.severity is Severity.ERROR:

@@ -15,6 +15,7 @@ from powderdsl.editing.cursor import Cursor, cursor_at, keys_at, values_at
 from powderdsl.editing.words import Word, definitions, language_words, occurrences
 from powderdsl.model.builtins import RESERVED
 from powderdsl.model.declarations import PackDecl
+from powderdsl.model.kept import Kept
 from powderdsl.model.schema import NAME
 from powderdsl.model.types import Ruleset
 from powderdsl.syntax.parse import reserved_words
@@ -56,10 +57,10 @@ class Rules:
     model: Ruleset | None = None
     words: dict[str, list[Word]] = field(default_factory=dict)
 
-    def read(self, names: Sequence[str | Path]) -> None:
-        """Read the packs with some names; keep the previous ones if there are none."""
-        if packs := read(names, Reporter())[0]:
-            self.packs, self.words = packs, {}
+    def read(self, names: Sequence[str | Path], packs: Sequence[PackDecl] = ()) -> None:
+        """Read the packs with some names unless they are known; keep the previous ones if there are none."""
+        if packs := packs or read(names, Reporter())[0]:
+            self.packs, self.words = [*packs], {}
             for word in (*language_words(), *definitions(packs)):
                 self.words.setdefault(word.name, []).append(word)
 
@@ -78,6 +79,7 @@ class Workspace:
     def __init__(self, beside: str = "", commands: Callable[[], Commands] = dict):
         self.beside, self.commands = beside, commands
         self.rules: dict[Path, Rules] = {}
+        self.kept = Kept()
 
     def open(self, path: Path, text: str) -> None:
         """Note that a file is open, or that its text has changed."""
@@ -106,6 +108,7 @@ class Workspace:
             return ()
         known = self.rules.setdefault(path, Rules())
         names = [name for name in (self.beside, str(path)) if name]
+        packs: Sequence[PackDecl] = ()
         try:
             match self.kind(path):
                 case "task":
@@ -126,10 +129,11 @@ class Workspace:
                     read_scenes(Source(str(path), self.text(path)), reporter)
                     return reporter.diagnostics
                 case _:
-                    known.model, remarks = load_with_diagnostics(*names)
+                    known.model, remarks = load_with_diagnostics(*names, kept=self.kept)
+                    packs = known.model.declared.packs if known.model.declared else ()
         except CompileError as error:
             remarks = error.diagnostics
-        known.read(names)
+        known.read(names, packs)
         return remarks
 
     # At a place

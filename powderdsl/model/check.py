@@ -37,6 +37,7 @@ from powderdsl.model.expressions.symbols import (
     report_unknown_names,
 )
 from powderdsl.model.expressions.typer import Typer
+from powderdsl.model.kept import Kept
 from powderdsl.model.logic.conflicts import check_logic
 from powderdsl.model.logic.needless import (
     overridden_ids,
@@ -95,6 +96,7 @@ def check(
     elsewhere: Callable[[], Mapping[str, str]] = dict,
     *,
     alone: bool = False,
+    kept: Kept | None = None,
 ) -> Ruleset:
     """The checked model of some packs. Raises CompileError; warnings and notes stay with the reporter.
 
@@ -102,9 +104,13 @@ def check(
         palette: ids that were recorded earlier, see `model/composition/compose.py`.
         elsewhere: words that packs define which are not loaded, with the pack.
         alone: treat no pack as added to others, so that conflicts are errors.
+        kept: results of earlier checks.
     """
     typer, element_values = resolve_names(packs, ruleset, reporter, palette)
     composition = typer.symbols
+    if kept is not None:
+        typer.kept = kept
+        kept.begin(composition)
     elaborated = Elaborator(typer)
     elaborated.run(composition.passes)
     report_undeclared_needs(typer)  # tests and invariants only concern what is loaded
@@ -270,15 +276,15 @@ def check_invariants(
     written = [(name, line, None) for name, pack in composition.packs.items() for line in pack.invariants]
     for ruleset in composition.ruleset.lineage:
         for line in ruleset.invariants:
-            written.append((ruleset.name.text, with_optional(line, composition.left_out), ruleset))
+            marked = with_optional(line, composition.left_out) if composition.left_out else line
+            written.append((ruleset.name.text, marked, ruleset))
     invariants = []
     reporter = typer.reporter
     for pack, line, author in written:
-        scope = composition.scope(author or pack, words_of(line))
         typer.reporter = Reporter()
         try:
-            claim, without = _claim(typer, line, pack)
-            invariants.append(Invariant(claim, without, pack, line.span, scope))
+            run = partial(_invariant, typer, line, pack, author)
+            invariants.append(typer.kept.of(line.span, [*composition.names_by_id], typer, run))
         except Poisoned:
             pass
         except Unresolved as missing:
@@ -286,8 +292,9 @@ def check_invariants(
                 "PD506", f"this invariant is inactive: `{missing.name}` is not loaded", line.span, "left out",
                 helps=[f"it becomes active with a pack that defines `{missing.name}`"],
             )  # fmt: skip
-        added = [name for name in composition.packs if name not in scope]
         for remark in typer.reporter.diagnostics:
+            scope = composition.scope(author or pack, words_of(line))
+            added = [name for name in composition.packs if name not in scope]
             if remark.code == "PD511" and added and check_alone(scope, Reporter()):
                 names = ", ".join(f"`{name}`" for name in added)
                 words_there = f"with {names}, `{one_line(line.span)}` can no longer hold"
@@ -298,11 +305,11 @@ def check_invariants(
     return tuple(invariants)
 
 
-def _claim(typer: Typer, line: Syntax, pack: str) -> tuple[Claim, frozenset[int]]:
-    """The claim of a line, and the elements that start worlds must not contain. Raises Poisoned or Unresolved."""
+def _invariant(typer: Typer, line: Syntax, pack: str, author: RulesetDecl | None) -> Invariant:
+    """The invariant of a line. Raises Poisoned or Unresolved."""
     typer.absent.clear()
     typer.start_rule(line.span)
-    scope, without = Scope(pack, {}), frozenset[int]()
+    scope, without, span, words = Scope(pack, {}), frozenset[int](), line.span, [*words_of(line)]
     if line.kind == "without":
         line, what = line.children
         without = frozenset(typer.set_of(typer.evaluate(what, scope), what.span).ids)
@@ -310,7 +317,8 @@ def _claim(typer: Typer, line: Syntax, pack: str) -> tuple[Claim, frozenset[int]
             label = "every world has some of these"
             raise typer.fail("PD511", "this invariant cannot hold", what.span, label)
         typer.absent.clear()  # a world is without elements of packs that are not loaded
-    return _Statement(typer, scope).claim(line), without
+    known = typer.symbols.scope(author or pack, words)
+    return Invariant(_Statement(typer, scope).claim(line), without, pack, span, known)
 
 
 _FORMS = (

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
+from functools import partial
 
 from powderdsl.diagnostics import Span, suggest
 from powderdsl.model.builtins import DIRECTION_SETS, DIRECTIONS
@@ -83,9 +84,12 @@ class Elaborator:
         self._rules = self._tried = 0
 
     def run(self, passes: Mapping[str, PassDecl]) -> None:
+        found = [(self, name, 0) for name in ("streams", "overridden", "inactive", "empty", "active")]
+        effects = (*found, (self, "_rules", MAX_RULES), (self, "_tried", MAX_TRIED))
         for name, decl in passes.items():
             with suppress(Poisoned):
-                self.passes.append(self._pass(name, decl))
+                run = partial(self._pass, name, decl)
+                self.passes.append(self.typer.kept.of(decl.span, name, self.typer, run, *effects))
         for span, name in self.inactive.items():
             if span not in self.active:
                 helps = [f"it becomes active with a pack that defines `{name}`"]
@@ -133,7 +137,7 @@ class Elaborator:
             is_new = self.typer.is_new(scalar, scope)
             scope = scope.bind(**{scalar.text: self._let(scalar.text, syntax, scope) if is_new else Broken()})
         rounds = self._rounds(block, scope, label)
-        if rounds == [] and block.header is not None and not self.typer.reporter.has_errors:
+        if rounds == [] and block.header is not None:
             self.typer.reporter.report(
                 "PD506", "this loop has no iterations", block.header.span, "nothing to loop over",
                 helps=["it becomes active with a pack that has such elements"],
@@ -158,13 +162,13 @@ class Elaborator:
                 self.typer.fail("PD508", message, header.span, label, fix)
                 return []
             return [(scope, f"{label}round {i + 1}") for i in range(rounds)]
+        variables = [binding.children[0].text for binding in header.children]
+        others = self.typer.used.intersection(variables)
         try:
             scopes = self.typer.bindings(header.children, scope)
         except (Poisoned, Unresolved):
             return []
-        variables = [binding.children[0].text for binding in header.children]
-        for variable in variables:
-            self.typer.used.discard(variable)
+        self.typer.used -= {*variables} - others
         labeled = []
         for inner in scopes:
             words = [f"{name} = {_name_of(inner.locals[name])}" for name in variables]

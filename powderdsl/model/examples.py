@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
+from dataclasses import replace
 from fractions import Fraction
 from itertools import chain, product
 from math import lcm
@@ -113,40 +114,48 @@ ANYTHING = "?"
 
 def check_examples(typer: Typer) -> tuple[Example, ...]:
     """The tests of all packs, checked: characters known, rows equally long."""
-    examples = []
-    composition = typer.symbols
+    examples, composition = [], typer.symbols
+    names, elements = composition.names, composition.elements
+    known = {name: (name, element.id, names.pack(name)) for name, element in elements.items()}
     for name, pack in composition.packs.items():
         if not pack.tests:
             continue
-        ids = {}
-        for known, element in composition.elements.items():
-            for word in (known, element.qualified, element.word or known):
-                ids[word] = composition.elements[composition.element(word, name) or known].id
+        glyphs = {element.glyph: word for word, element in elements.items()}
         # Glyphs keep the meaning that they have without packs added later.
-        alone = composition.glyphs_alone(composition.scope(name))
-        for decl in pack.tests:
+        glyphs |= {glyph: word for word, glyph in composition.glyphs_alone(composition.scope(name)).items()}
+        # Glyphs of the pack's own file take precedence over those of other packs.
+        declared = ((word, decl) for word, decl in names.declared(ElementDecl).items() if decl.pack == name)
+        glyphs |= {decl.glyph: word for word, decl in declared if decl.glyph}
+        legend = tuple(sorted(glyphs.items()))
+        for test in pack.tests:
+            drawings = test.given, test.expect, *dict((*test.fields, *test.expect_fields)).values()
+            drawn = {"#", *chain(*(part.text for part in drawings if part))}  # `#` may begin a comment
+            meant = {glyph: known.get(glyphs.get(glyph, "")) for glyph in drawn}
             with suppress(Poisoned, Unresolved):
-                examples.append(_ExampleReader(typer, name, decl, ids, alone).example())
+                reader = _ExampleReader(typer, name, test, glyphs)
+                example = typer.kept.of(test.name.span, meant, typer, reader.example)
+                own = {key.text: names.of(name, value.word) for key, value in test.legend}
+                whole = tuple(sorted((glyphs | own).items())) if own else legend
+                examples.append(example if example.legend == whole else replace(example, legend=whole))
     return tuple(examples)
 
 
 class _ExampleReader:
     """Reads one test. Its methods raise Poisoned after reporting, Unresolved for a test that needs an absent pack.
 
-    `ids` are by the words of elements that the pack uses, and `glyphs` are theirs in its scope.
+    `legend` has the elements of characters, by global name.
     """
 
-    def __init__(
-        self, typer: Typer, pack: str, decl: TestDecl, ids: Mapping[str, int], glyphs: Mapping[str, str]
-    ):
+    def __init__(self, typer: Typer, pack: str, decl: TestDecl, legend: dict[str, str]):
         self.typer, self.pack, self.decl = typer, pack, decl
-        self.composition, self.ids, self.glyphs = typer.symbols, ids, glyphs
-        self.legend = self._legend()
+        self.composition, self.legend = typer.symbols, legend
         self.given: tuple[str, ...] = ()
         """The rows of the first world, once they are read."""
 
     def example(self) -> Example:
         decl, typer, name, place = self.decl, self.typer, self.decl.name.text, self.decl.name.span
+        self.typer.start_rule(place)
+        self.legend = self.legend | self._own_legend()
         if decl.given is None:
             raise typer.fail("PD109", f"the test `{name}` has no start world", place, "`given` is missing")
         given = self.given = self._rows(decl.given, wildcard=False)
@@ -155,8 +164,7 @@ class _ExampleReader:
         size = f"`given` has {len(given)} row{'s' * (len(given) != 1)} of {len(given[0])}"
         if expect and decl.expect and (len(expect), len(expect[0])) != (len(given), len(given[0])):
             raise typer.fail("PD110", "`expect` and `given` have different sizes", decl.expect.span, size)
-        elements = self.composition.elements
-        ids = {**self.ids, **{character: elements[meaning].id for character, meaning in self.legend.items()}}
+        ids = self._ids() if decl.fields or decl.expect_fields else {}
         fields = self._grids(decl.fields, ids, size, expected=False)
         expect_fields = self._grids(decl.expect_fields, ids, size, expected=True)
         params = self._params()
@@ -213,15 +221,19 @@ class _ExampleReader:
             raise Poisoned
         return values
 
-    def _legend(self) -> dict[str, str]:
-        """The elements, by global name, of the characters of a test."""
+    def _ids(self) -> dict[str, int]:
+        """The elements' ids by the words and characters that the pack may use for them."""
+        composition, elements = self.composition, self.composition.elements
+        ids: dict[str, int] = {}
+        for name, element in elements.items():
+            for word in (name, element.qualified, element.word or name):
+                ids[word] = elements[composition.element(word, self.pack) or name].id
+        return ids | {character: elements[name].id for character, name in self.legend.items()}
+
+    def _own_legend(self) -> dict[str, str]:
+        """The elements, by global name, of the characters in the test's own legend."""
         composition = self.composition
-        legend = {element.glyph: name for name, element in composition.elements.items()}
-        legend |= {glyph: name for name, glyph in self.glyphs.items()}
-        # Glyphs of the pack's own file take precedence over those of other packs.
-        for name, decl in composition.names.declared(ElementDecl).items():
-            if decl.pack == self.pack and decl.glyph:
-                legend[decl.glyph] = name
+        legend: dict[str, str] = {}
         for key, value in self.decl.legend:
             element = composition.element(value.word, self.pack)
             if element is None:

@@ -7,6 +7,7 @@ import json
 import random
 import re
 import sys
+import time
 from collections.abc import Awaitable, Callable
 from pathlib import Path
 from typing import Any
@@ -46,10 +47,13 @@ class Editor:
         self.client = LanguageClient("test", "1")
         self.published: dict[str, list[Any]] = {}
         self.heard = asyncio.Event()
+        self.heard_at = 0.0
+        """When the mistakes of the open file came last."""
 
         @self.client.feature(lsp.TEXT_DOCUMENT_PUBLISH_DIAGNOSTICS)
         def published(params: Any) -> None:
             self.published[params.uri] = params.diagnostics
+            self.heard_at = time.perf_counter() if params.uri == self.uri else self.heard_at
             self.heard.set()
 
     @property

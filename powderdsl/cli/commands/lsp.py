@@ -130,6 +130,9 @@ def server(beside: str = "") -> Any:
         path = path_of(params.text_document)
         files.open(path, served.workspace.get_text_document(params.text_document.uri).source)
         check(path)
+        waiting = getattr(served.protocol, "_request_futures", {})  # pygls never removes notifications
+        for key in [key for key, future in waiting.items() if future.done()]:
+            del waiting[key]
 
     @served.feature(lsp.TEXT_DOCUMENT_DID_CLOSE)
     def closed(params: lsp.DidCloseTextDocumentParams) -> None:

@@ -45,6 +45,7 @@ from powderdsl.model.expressions.operators import (
     rotate,
 )
 from powderdsl.model.expressions.symbols import read_bounds, read_number
+from powderdsl.model.kept import MAX_WORK, Kept
 from powderdsl.model.logic.needless import report_repeated
 from powderdsl.model.operations import FUNCTIONS
 from powderdsl.model.types import (
@@ -71,9 +72,6 @@ MAX_ROUNDS = 4096
 
 MAX_RULE_WORK = 5_000
 """Maximum number of parts of expressions in one rule, with quantifiers unrolled."""
-
-MAX_WORK = 60_000
-"""Maximum number of parts of expressions in all rules, which takes a second or two."""
 
 MAX_SET_DEPTH = 24
 """Maximum length of a chain of sets defined by one another."""
@@ -134,8 +132,9 @@ class Typer:
         self.undeclared: dict[tuple[str, str], Span] = {}
         """The first places of names used by a pack but not defined by a pack that it needs."""
         self._sets_too_deep = False
-        self._work = self._rule_start = 0
+        self.work = self._rule_start = 0
         self._rule_span: Span | None = None
+        self.kept = Kept()
 
     def evaluate(self, syntax: Syntax, scope: Scope) -> Operand:
         """The operand of some syntax. Raises Poisoned after reporting, Unresolved if it depends on an absent name."""
@@ -160,19 +159,19 @@ class Typer:
 
     def spend(self, parts: int, span: Span) -> None:
         """Count parts of expressions. Raises Poisoned if a rule, or all rules together, have too many."""
-        if self._work > MAX_WORK:
+        if self.work > MAX_WORK:
             raise Poisoned  # already reported, and true for everything that follows
-        self._work += parts
-        if self._work - self._rule_start > MAX_RULE_WORK or self._work > MAX_WORK:
-            self._rule_start = self._work  # once per rule is enough
-            what = "a rule that expands" if self._work <= MAX_WORK else "rules that expand"
+        self.work += parts
+        if self.work - self._rule_start > MAX_RULE_WORK or self.work > MAX_WORK:
+            self._rule_start = self.work  # once per rule is enough
+            what = "a rule that expands" if self.work <= MAX_WORK else "rules that expand"
             fix = "loop over fewer things, or name parts under `let:`"
             label = "unrolled, it has thousands of parts"
             raise self.fail("PD508", f"{what} to too much", self._rule_span or span, label, fix)
 
     def start_rule(self, span: Span) -> None:
         """Start counting the work of the rule or value at `span`."""
-        self._rule_start, self._rule_span = self._work, span
+        self._rule_start, self._rule_span = self.work, span
         self.empty.clear()
 
     def condition(self, syntax: Syntax, scope: Scope) -> Expr:
@@ -368,6 +367,7 @@ class Typer:
         if self.symbols.is_declared(name, scope.pack):
             raise Poisoned  # mistakes in its declaration have been reported
         self.unknown.setdefault((name, after_dot), {})[span] = scope.locals
+        self.reporter.reports += 1
         raise Poisoned
 
     def find(self, name: str, span: Span, scope: Scope) -> Operand | None:
