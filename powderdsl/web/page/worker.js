@@ -32,7 +32,10 @@ async function boot() {
 const bridge = boot();
 bridge.then(
   () => stage("ready"),
-  (error) => postMessage({ stage: "failed", error: String(error.message ?? error) }),
+  (error) => {
+    globalThis.caches?.delete("powderdsl").catch(() => {}); // the next worker starts afresh
+    postMessage({ stage: "failed", error: String(error.message ?? error) });
+  },
 );
 
 onmessage = async ({ data: { id, name, args } }) => {
