@@ -13,9 +13,10 @@ async function boot() {
   // The browser keeps the memory of a started compiler: that of the same archive starts in a third of the time.
   const cache = await globalThis.caches?.open("powderdsl").catch(() => {});
   const kept = await cache?.match(place);
-  const hash = async () => String(new Uint8Array(await crypto.subtle.digest("SHA-256", await fetched)));
-  const isSame = kept && kept.headers.get("of") === (await hash());
-  let python = isSame && (await start({ _loadSnapshot: new Uint8Array(await kept.arrayBuffer()) }).catch(() => null));
+  const nameOf = async ({ length }) => `${length} ${new Uint8Array(await crypto.subtle.digest("SHA-256", await fetched))}`;
+  const bytes = kept && new Uint8Array(await kept.arrayBuffer());
+  const isSame = bytes && kept.headers.get("of") === (await nameOf(bytes));
+  let python = isSame && (await start({ _loadSnapshot: bytes }).catch(() => null));
   const isFresh = !python;
   python ||= await start({ _makeSnapshot: true });
   globalThis.python = python; // for measurements of its memory
@@ -25,7 +26,7 @@ async function boot() {
   stage("starting");
   python.runPython("import sys; sys.dont_write_bytecode = True; import powderdsl.web.bridge");
   const memory = isFresh && cache && python.makeMemorySnapshot();
-  if (memory) hash().then((of) => cache.put(place, new Response(memory, { headers: { of } }))).catch(() => {});
+  if (memory) nameOf(memory).then((of) => cache.put(place, new Response(memory, { headers: { of } }))).catch(() => {});
   return python.pyimport("powderdsl.web.bridge");
 }
 
