@@ -87,7 +87,11 @@ def test_what_has_not_changed_is_not_checked_again(folder: Path, monkeypatch: py
         checked.clear()
         files.open(path, text)
         assert not [mistake for mistake in files.check(path) if mistake.severity is Severity.ERROR]
-        return set(checked)
+        found = set(checked)
+        first = Workspace("powderworld")
+        first.check(path)
+        assert files.rules[path].model == first.rules[path].model
+        return found
 
     assert packs(PACK) > {"core", "water", "slime"}
     assert packs(PACK.replace("It creeps down", "It creeps")) == {"slime"}
