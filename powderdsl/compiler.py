@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from powderdsl.ir.bits import Segment
     from powderdsl.ir.ops import PassGraph, Program
     from powderdsl.model.composition.compose import Palette
-    from powderdsl.model.kept import Kept
+    from powderdsl.model.reuse import Reuse
 
 BACKENDS = {
     "auto": "`wasm` first, and `native` once it is compiled; `cuda`, or else `torch`, on other devices",
@@ -125,21 +125,21 @@ def load_with_diagnostics(
     *names: str | Path,
     params: Mapping[str, Any] | None = None,
     palette: Palette | None = None,
-    kept: Kept | None = None,
+    reuse: Reuse | None = None,
 ) -> tuple[Ruleset, tuple[Diagnostic, ...]]:
-    """Read as `load` does; return the model, and warnings and notes in source order. `kept` is as in `check`."""
+    """Read as `load` does; return the model, and warnings and notes in source order. `reuse` is as in `check`."""
     reporter = Reporter()
     reader = _Reader(reporter)
     packs, ruleset = reader.read_all(names)
     if reporter.has_errors:
         if reader.is_whole and not any(d.code == "PD111" for d in reporter.diagnostics):
-            _report_more(packs, ruleset, reader, palette=palette, kept=kept)
+            _report_more(packs, ruleset, reader, palette=palette, reuse=reuse)
         reporter.raise_if_errors()
 
     def checked() -> tuple[Ruleset, tuple[Diagnostic, ...]]:
         from powderdsl.model.check import check, demote_outgrown
 
-        model = check(packs, ruleset, reporter, palette, shipped_words, kept=kept)
+        model = check(packs, ruleset, reporter, palette, shipped_words, reuse=reuse)
         reporter.raise_if_errors()
         return model, demote_outgrown(model, reporter.diagnostics)
 

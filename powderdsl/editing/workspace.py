@@ -15,7 +15,7 @@ from powderdsl.editing.cursor import Cursor, cursor_at, keys_at, values_at
 from powderdsl.editing.words import Word, definitions, language_words, occurrences
 from powderdsl.model.builtins import RESERVED
 from powderdsl.model.declarations import PackDecl
-from powderdsl.model.kept import Kept
+from powderdsl.model.reuse import Reuse
 from powderdsl.model.schema import NAME
 from powderdsl.model.types import Ruleset
 from powderdsl.syntax.parse import reserved_words
@@ -79,7 +79,7 @@ class Workspace:
     def __init__(self, beside: str = "", commands: Callable[[], Commands] = dict):
         self.beside, self.commands = beside, commands
         self.rules: dict[Path, Rules] = {}
-        self.kept = Kept()
+        self.reuse = Reuse()
 
     def open(self, path: Path, text: str) -> None:
         """Note that a file is open, or that its text has changed."""
@@ -129,7 +129,7 @@ class Workspace:
                     read_scenes(Source(str(path), self.text(path)), reporter)
                     return reporter.diagnostics
                 case _:
-                    known.model, remarks = load_with_diagnostics(*names, kept=self.kept)
+                    known.model, remarks = load_with_diagnostics(*names, reuse=self.reuse)
                     packs = known.model.declared.packs if known.model.declared else ()
         except CompileError as error:
             remarks = error.diagnostics

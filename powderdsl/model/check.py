@@ -37,7 +37,6 @@ from powderdsl.model.expressions.symbols import (
     report_unknown_names,
 )
 from powderdsl.model.expressions.typer import Typer
-from powderdsl.model.kept import Kept
 from powderdsl.model.logic.conflicts import check_logic
 from powderdsl.model.logic.needless import (
     overridden_ids,
@@ -48,6 +47,7 @@ from powderdsl.model.logic.needless import (
     without_dead_overrides,
 )
 from powderdsl.model.logic.satisfy import Facts
+from powderdsl.model.reuse import Reuse
 from powderdsl.model.text import one_line, place_of
 from powderdsl.model.types import (
     Bounded,
@@ -96,7 +96,7 @@ def check(
     elsewhere: Callable[[], Mapping[str, str]] = dict,
     *,
     alone: bool = False,
-    kept: Kept | None = None,
+    reuse: Reuse | None = None,
 ) -> Ruleset:
     """The checked model of some packs. Raises CompileError; warnings and notes stay with the reporter.
 
@@ -104,13 +104,13 @@ def check(
         palette: ids that were recorded earlier, see `model/composition/compose.py`.
         elsewhere: words that packs define which are not loaded, with the pack.
         alone: treat no pack as added to others, so that conflicts are errors.
-        kept: results of earlier checks.
+        reuse: results of earlier checks.
     """
     typer, element_values = resolve_names(packs, ruleset, reporter, palette)
     composition = typer.symbols
-    if kept is not None:
-        typer.kept = kept
-        kept.begin(composition)
+    if reuse is not None:
+        typer.reuse = reuse
+        reuse.begin(composition)
     elaborated = Elaborator(typer)
     elaborated.run(composition.passes)
     report_undeclared_needs(typer)  # tests and invariants only concern what is loaded
@@ -284,7 +284,7 @@ def check_invariants(
         typer.reporter = Reporter()
         try:
             run = partial(_invariant, typer, line, pack, author)
-            invariants.append(typer.kept.of(line.span, [*composition.names_by_id], typer, run))
+            invariants.append(typer.reuse.of(line.span, [*composition.names_by_id], typer, run))
         except Poisoned:
             pass
         except Unresolved as missing:

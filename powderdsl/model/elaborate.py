@@ -89,7 +89,7 @@ class Elaborator:
         for name, decl in passes.items():
             with suppress(Poisoned):
                 run = partial(self._pass, name, decl)
-                self.passes.append(self.typer.kept.of(decl.span, name, self.typer, run, *effects))
+                self.passes.append(self.typer.reuse.of(decl.span, name, self.typer, run, *effects))
         for span, name in self.inactive.items():
             if span not in self.active:
                 helps = [f"it becomes active with a pack that defines `{name}`"]

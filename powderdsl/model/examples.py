@@ -133,7 +133,7 @@ def check_examples(typer: Typer) -> tuple[Example, ...]:
             meant = {glyph: known.get(glyphs.get(glyph, "")) for glyph in drawn}
             with suppress(Poisoned, Unresolved):
                 reader = _ExampleReader(typer, name, test, glyphs)
-                example = typer.kept.of(test.name.span, meant, typer, reader.example)
+                example = typer.reuse.of(test.name.span, meant, typer, reader.example)
                 own = {key.text: names.of(name, value.word) for key, value in test.legend}
                 whole = tuple(sorted((glyphs | own).items())) if own else legend
                 examples.append(example if example.legend == whole else replace(example, legend=whole))

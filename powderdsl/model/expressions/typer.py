@@ -45,9 +45,9 @@ from powderdsl.model.expressions.operators import (
     rotate,
 )
 from powderdsl.model.expressions.symbols import read_bounds, read_number
-from powderdsl.model.kept import MAX_WORK, Kept
 from powderdsl.model.logic.needless import report_repeated
 from powderdsl.model.operations import FUNCTIONS
+from powderdsl.model.reuse import MAX_WORK, Reuse
 from powderdsl.model.types import (
     CHANCE,
     DIRECTION,
@@ -134,7 +134,7 @@ class Typer:
         self._sets_too_deep = False
         self.work = self._rule_start = 0
         self._rule_span: Span | None = None
-        self.kept = Kept()
+        self.reuse = Reuse()
 
     def evaluate(self, syntax: Syntax, scope: Scope) -> Operand:
         """The operand of some syntax. Raises Poisoned after reporting, Unresolved if it depends on an absent name."""

@@ -32,8 +32,8 @@ class _Version(NamedTuple):
     """By place: a result, what it depends on besides its text and the words, and what was changed."""
 
 
-class Kept:
-    """Results by file. Only checks that report nothing are kept, so that all others report again."""
+class Reuse:
+    """Results by file. Results of checks that report something are not stored, so that these checks report again."""
 
     def __init__(self) -> None:
         self._versions: dict[str, list[_Version]] = {}  # of each file the last three, newest first
@@ -47,27 +47,29 @@ class Kept:
             same = [version for version in versions if version.source == source]
             words = same[0].words if same else tuple({*re.findall(r"\w+", source.text)})
             now = [setting, *map(meanings.get, words)]
-            new = _Version(source, words, now, {})
-            found = next((version for version in same if version.meanings == now), new)
-            others = [version for version in versions if version is not found]
-            self._versions[source.name] = [found, *others[:2]]
+            empty = _Version(source, words, now, {})
+            current = next((version for version in same if version.meanings == now), empty)
+            others = [version for version in versions if version is not current]
+            self._versions[source.name] = [current, *others[:2]]
 
-    def of(self, place: Span, others: object, typer: Typer, make: Callable[[], T], *more: Any) -> T:
-        """The result for the pass, the test or the invariant at a place, from `make` unless it is kept.
+    def of(self, place: Span, inputs: object, typer: Typer, make: Callable[[], T], *more: Any) -> T:
+        """The result for the pass, the test or the invariant at a place: an earlier one, or that of `make`.
 
-        `others`: what it depends on besides its text and the words of its file. `more`: effects.
+        `inputs`: what it depends on besides its text and the words of its file. `more`: effects.
         """
         if place.source.name not in self._versions:
             return make()
         effects: Effects = ((typer, "used", 0), (typer, "undeclared", 0), (typer, "work", MAX_WORK), *more)
         version = self._versions[place.source.name][0]
-        old = [getattr(owner, name) for owner, name, _ in effects]
-        kept, inputs, changes = version.results.get(place, (None, self, []))
-        if inputs == others and all(
-            a + b <= c for a, b, (*_, c) in zip(old, changes, effects, strict=True) if c
+        before = [getattr(owner, name) for owner, name, _ in effects]
+        result, earlier, changes = version.results.get(place, (None, self, []))
+        if earlier == inputs and all(
+            value + change <= most
+            for value, change, (*_, most) in zip(before, changes, effects, strict=True)
+            if most
         ):
-            _apply(effects, old, changes)
-            return kept
+            _apply(effects, before, changes)
+            return result
         for owner, name, most in effects:
             if not most:
                 setattr(owner, name, type(getattr(owner, name))())
@@ -75,12 +77,15 @@ class Kept:
         try:
             made = make()
         finally:
-            new = [getattr(owner, name) for owner, name, _ in effects]
-            changes = [b - a if most else b for a, b, (*_, most) in zip(old, new, effects, strict=True)]
-            _apply(effects, old, changes)
+            after = [getattr(owner, name) for owner, name, _ in effects]
+            changes = [
+                new - old if most else new
+                for old, new, (*_, most) in zip(before, after, effects, strict=True)
+            ]
+            _apply(effects, before, changes)
         # A backslash in a file may spell words that are not in its text.
         if typer.reporter.reports == reports and "\\" not in version.source.text:
-            version.results[place] = made, others, changes
+            version.results[place] = made, inputs, changes
         return made
 
 
@@ -102,14 +107,14 @@ def _setting(symbols: Composition) -> object:
 def _meanings(symbols: Composition) -> dict[str, list[object]]:
     """For each word, all names that it may be short for, with what the checker of lines knows of them."""
     names, ids, order = symbols.names, symbols.names_by_id, symbols.order
-    found: dict[str, list[object]] = defaultdict(list, any=[ids, order])
+    meanings: dict[str, list[object]] = defaultdict(list, any=[ids, order])
     for qualified, name in names.known.items():
         constant, prop = symbols.constants.get(name), symbols.properties.get(name)
         members = [(ids[i], order[i]) for i in constant.ids] if isinstance(constant, SetOf) else ()
         others = prop and prop.kind, symbols.fields.get(name), symbols.streams.get(name)
         for word in {qualified.rpartition(".")[2], name.rpartition(".")[2]}:
-            found[word].append((qualified, name, names.pack(name), constant, members, others))
+            meanings[word].append((qualified, name, names.pack(name), constant, members, others))
     for qualified in symbols.param_decls:
         param = symbols.params.get(qualified)
-        found[qualified.rpartition(".")[2]].append((qualified, param and param.kind))
-    return found
+        meanings[qualified.rpartition(".")[2]].append((qualified, param and param.kind))
+    return meanings
