@@ -322,6 +322,6 @@ def test_what_was_saved_elsewhere_is_refused(small: TaskProgram, tmp_path: Path)
         env.restore(other.state())
     state = env.state()
     state["episodes"]["state"].pop("element")
-    with pytest.raises(ValueError, match="another state"):
+    with pytest.raises(ValueError, match="their state or size differs"):
         env.restore(state)
     assert same(env.state(), before)

@@ -73,7 +73,7 @@ def test_preset_and_options_make_the_configuration(tmp_path: Path, dunes: str) -
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        (("train", "--packs", "core", "--held-out", "sand"), "give one of them"),
+        (("train", "--packs", "core", "--held-out", "sand"), "cannot be combined"),
         (("train", "--held-out", "snad"), "did you mean `sand`?"),
         (("train", "--rules", "core+snad"), "PD304"),
         (("train", "--knob", "kinds=99"), "the knob `kinds` must lie in 0..4"),
