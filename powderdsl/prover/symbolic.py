@@ -294,7 +294,7 @@ class Symbols:
             bits = row.bits(world, *cell)
             if row.slot.kind.name == "element":
                 facts.append(net.member(bits, self.ids))
-            elif row.lo < row.hi:
+            else:
                 lo, hi = (ranges or {}).get(row.slot.name, (row.lo, row.hi))
                 facts.append(net.within(bits, lo, hi, signed=row.signed))
             groups: dict[int, list[int]] = {}

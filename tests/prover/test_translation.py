@@ -149,6 +149,25 @@ def test_a_wrong_rewrite_is_found(
     assert "differs" in [found.verdict for found in compare(ruleset, each_stage=False)]
 
 
+def test_a_field_of_one_value_holds_it() -> None:
+    ruleset = load_text(
+        """
+pack: constant
+elements:
+  ground: {id: 0, color: "#000000"}
+  sand: {id: 1, color: "#C0A060"}
+fields:
+  heat: {type: 0..0, at: place}
+passes:
+  warm:
+    do:
+      - ground -> sand if at(3, 0).heat > heat or below is sand
+      - sand -> ground if below is ground
+"""
+    )
+    assert {found.verdict for found in compare(ruleset, each_stage=True)} == {"equal"}
+
+
 # Random rulesets
 
 FEW, MANY = range(60, 80), [range(first, first + 100) for first in range(0, 2000, 100)]
