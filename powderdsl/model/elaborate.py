@@ -84,8 +84,8 @@ class Elaborator:
         self._rules = self._tried = 0
 
     def run(self, passes: Mapping[str, PassDecl]) -> None:
-        found = [(self, name, 0) for name in ("streams", "overridden", "inactive", "empty", "active")]
-        effects = (*found, (self, "_rules", MAX_RULES), (self, "_tried", MAX_TRIED))
+        collected = [(self, name, 0) for name in ("streams", "overridden", "inactive", "empty", "active")]
+        effects = (*collected, (self, "_rules", MAX_RULES), (self, "_tried", MAX_TRIED))
         for name, decl in passes.items():
             with suppress(Poisoned):
                 run = partial(self._pass, name, decl)

@@ -436,16 +436,22 @@ def licenses() -> bytes:
 
 
 ABSENT = (
-    *("cli", "data/tasks", "datasets", "envs", "experiments", "ogbench", "rl", "targets/cuda", "tasks"),
-    *(
-        "testing/mutation",
-        "web/made",
-        "web/page",
-        "web/parts",
-        "web/playable.py",
-        "web/site.py",
-        "worldmodel",
-    ),
+    "cli",
+    "data/tasks",
+    "datasets",
+    "envs",
+    "experiments",
+    "ogbench",
+    "rl",
+    "targets/cuda",
+    "tasks",
+    "testing/mutation",
+    "web/made",
+    "web/page",
+    "web/parts",
+    "web/playable.py",
+    "web/site.py",
+    "worldmodel",
 )
 """Parts of powderdsl that `web/bridge.py` does not import: the command line, modules that require torch, and the page
 itself."""

@@ -221,7 +221,7 @@ def judge(original: Original, mutant: Mutant, seed: int = 0) -> Verdict:
 
 
 def failed_test(original: Original, sim: Simulator, pack: str, *phases: int) -> Verdict | None:
-    """The verdict by a test of some phases that the original passes and the mutant fails: by hand, if there is one.
+    """The verdict of the first test of some phases that the original passes and the mutant fails, or None.
 
     Phase 0 has the mutated pack's tests, which fail most often; phase 1 those of other packs, and phase 2 those that
     the tool has written and those of other packs that count, each of which runs many worlds.
@@ -346,7 +346,7 @@ def _begin_process() -> None:
         os._exit(1)
 
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    cache.STORED = False  # nobody compiles a mutant again
+    cache.STORED = False  # no mutant is compiled twice
     Thread(target=end_with_parent, daemon=True).start()
 
 

@@ -104,7 +104,7 @@ export async function restore() {
   const heads = (await answer(read("heads").getAll())).sort((a, b) => b.when - a.when);
   // The address may have changed since it was kept, so the entry of the history says what it showed.
   const id = history.state?.work;
-  let head = heads.find((one) => (id ? one.id === id : one.id === sessionStorage.getItem("work") && one.place === place()));
+  let head = heads.find((each) => (id ? each.id === id : each.id === sessionStorage.getItem("work") && each.place === place()));
   const words = `Your work of ${time(head ?? heads[0])} is back.`;
   if (!head && !place() && heads[0]?.isWork && !heads[0].open && heads[0].first === app.catalog.rules[0].key) {
     const { key, sheet } = await answer(read("works").get(heads[0].id));

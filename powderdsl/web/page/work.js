@@ -21,7 +21,7 @@ let supersede = () => {};
 
 /**
  * Puts another engine in place: `prepare` resolves to a function that does it at once. What began before a newer swap
- * never lands, nobody waits for it, and its failure interests nobody. Resolves to whether it has landed.
+ * never lands, and its failure is ignored. Resolves to whether it has landed.
  * @param {() => Promise<() => void>} prepare
  */
 export function swap(prepare) {
