@@ -47,7 +47,7 @@ class CompiledEnv(TensorEnv):
             return None
         if self._stepper is None or self._stepper.native is not native:
             self._stepper = Stepper(self.program, native, *plan_arguments(self, native))
-            self._results = ()
+        self._results = ()
         kept = {"episode": self._episode, "returned": self._returned, "waiting": self._ended}
         self.episodes = self._stepper.bind(self.episodes, self.params, kept)
         self._waiting = self._ended.numpy()
@@ -100,8 +100,7 @@ class CompiledEnv(TensorEnv):
 
     def _new_results(self, stepper: Stepper) -> Results:
         """Return unreferenced results for the next call to write to."""
-        fitting = (results for results in self._results if len(results.everyone) == self.num_envs)
-        results = next(filter(Results.is_free, fitting), None)
+        results = next(filter(Results.is_free, self._results), None)
         if results is None:
             space = self.observation.space
             keeps_last = self.autoreset_mode is AutoresetMode.SAME_STEP
@@ -109,6 +108,7 @@ class CompiledEnv(TensorEnv):
             shown = [make((self.num_envs, *space.shape), space.dtype) for _ in range(1 + keeps_last)]
             results = Results(np.empty(Results.SIZE * self.num_envs, np.uint8), *shown)
             del shown
+            results.watch()
             self._results = (results, *self._results[:2])
         stepper.write_to(results)
         return results
@@ -130,7 +130,7 @@ class CompiledEnv(TensorEnv):
             return observed, reward, terminated, truncated, arrays_of(shown)
         self._read(actions, stepper.numbers)
         mode = self.autoreset_mode
-        if mode is AutoresetMode.DISABLED and self._waiting.any():
+        if mode is AutoresetMode.DISABLED and np.count_nonzero(self._waiting):
             check_going(self._ended)
         results = self._new_results(stepper)
         results.everyone.fill(True)
@@ -158,13 +158,13 @@ class CompiledEnv(TensorEnv):
     def _read(self, actions: Any, numbers: Any) -> None:
         """Write actions into `numbers`, int64 [B, k]. Raises TypeError and ValueError as `TensorEnv.step`."""
         given = actions.numpy() if isinstance(actions, Tensor) else actions
-        shape = numbers.shape[: 1 if self.action_form.kind == "discrete" else 2]
-        if not isinstance(given, np.ndarray) or given.dtype.kind not in "iu" or given.shape != shape:
+        places = numbers[:, 0] if self.action_form.kind == "discrete" else numbers
+        if not isinstance(given, np.ndarray) or given.dtype.kind not in "iu" or given.shape != places.shape:
             checked = self.action_form.decode(actions)
             if len(checked) != self.num_envs:
                 raise ValueError(f"{len(checked)} actions for {self.num_envs} environments")
             given = np.asarray(actions)
-        numbers[...] = given if len(shape) == 2 else given[:, None]
+        places[...] = given
 
 
 def plan_arguments(env: TensorEnv, places: Places) -> tuple[Any, ...]:

@@ -205,14 +205,16 @@ class PowderEnv(Face, gymnasium.Env[Array, Any], EzPickle):
         return observed[0], float(reward[0]), bool(terminated[0]), bool(truncated[0]), self._info(info)
 
     def _info(self, info: Mapping[str, Any]) -> dict[str, Any]:
-        assert self.tensors.episodes is not None
+        returned, length = self.tensors.progress()
         infos = {
             "success": bool(info["success"][0]),
             "world": int(info["world"][0]),
-            "episode_return": float(self.tensors.returns[0]),
-            "episode_length": int(self.tensors.episodes.acted[0]),
+            "episode_return": returned,
+            "episode_length": length,
         }
-        return infos | ({"action_mask": np.asarray(info["action_mask"][0])} if "action_mask" in info else {})
+        if "action_mask" in info:
+            infos["action_mask"] = np.asarray(info["action_mask"][0])
+        return infos
 
     def action_masks(self) -> Array:
         """Return the mask of allowed actions: bool [n], the values of an action's first number, then of its second, …"""

@@ -49,8 +49,7 @@ class Shown(Recycled):
 
     def __init__(self, observed: Array):
         self.observed = observed
-        del observed
-        self.watch([self.observed])
+        self._arrays = [observed]
 
 
 class Joint:
@@ -89,6 +88,7 @@ class Joint:
         shown = next(filter(Shown.is_free, self._shown), None)
         if shown is None:
             shown = Shown(np.empty_like(self._observed))
+            shown.watch()
             self._shown = [shown, *self._shown[:2]]
         # Other modes make another copy.
         np.take(self._observed, self._order, 0, shown.observed, mode="clip")
@@ -281,6 +281,11 @@ class MixedEnv(CompiledEnv):
         return joined(
             [env.returns for env, _ in self._groups.values()], [rows for _, rows in self._groups.values()]
         )
+
+    def progress(self) -> tuple[float, int]:
+        """Return the return and length so far of the only episode."""
+        ((env, _),) = self._groups.values()
+        return env.progress()
 
     # Saving
 

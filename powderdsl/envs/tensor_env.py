@@ -298,6 +298,11 @@ class TensorEnv:
         """The return of each current episode so far: float64 [B]."""
         return self._returned.clone()
 
+    def progress(self) -> tuple[float, int]:
+        """Return the return and length so far of the only episode."""
+        assert self.episodes is not None
+        return self._returned.item(), int(self.episodes.acted.item())
+
     def _bases(self, seed: Any) -> tuple[Tensor, Tensor]:
         """The seed of each environment, and whether it is a new one."""
         old = self._base

@@ -231,7 +231,8 @@ class _Rows(Recycled):
 
     def __init__(self, shape: tuple[int, ...]):
         self.rows = np.empty(shape, np.uint8)
-        self.watch([self.rows])
+        self._arrays = [self.rows]
+        self.watch()
 
 
 class Episodes:

@@ -63,9 +63,10 @@ def _operations(scalar: Expr, measures: Mapping[Any, int], when: str) -> Iterato
 class Recycled:
     """Arrays to reuse once they are unreferenced, since new memory costs more than a step."""
 
-    def watch(self, arrays: list[Any]) -> None:
-        """Count the current references: only this object, and its views."""
-        self._arrays = arrays
+    _arrays: list[Any]
+
+    def watch(self) -> None:
+        """Count the current references, those of this object. Not for `__init__`, whose caller holds its arguments."""
         self._counts = self._references()
 
     def _references(self) -> list[int]:
@@ -110,13 +111,11 @@ class Results(Recycled):
             **dict.fromkeys(("_success", "_world"), self.everyone),
         }
         """Infos of all episodes."""
-        arrays = [memory, *rows, self.everyone, observed]
+        self._arrays = [memory, *rows, self.everyone, observed]
         if last_observed is not None:
-            arrays.append(last_observed)
+            self._arrays.append(last_observed)
         self.addresses = {"results": memory.ctypes.data, "observed": self.observed.ctypes.data}
         self.addresses["last_observed"] = 0 if self.last_observed is None else self.last_observed.ctypes.data
-        del memory, rows, observed, last_observed
-        self.watch(arrays)
 
 
 class Plan:

@@ -245,6 +245,29 @@ def test_results_that_are_held_stay(mode):
     assert len(memory) < 30
 
 
+def test_results_that_nobody_holds_are_used_again():
+    _, env = both(load_task("sand-pushing"), 2)
+    env.reset(seed=1)
+    for _ in range(3):
+        env.step_arrays(np.zeros((2, 5), np.int64))
+    results = env._results
+    for _ in range(3):
+        env.step_arrays(np.zeros((2, 5), np.int64))
+    assert env._results is results
+
+
+def test_observations_of_mixed_laws_that_nobody_holds_are_used_again():
+    from powderdsl.envs.mixed import Shown
+
+    shown = Shown(np.zeros(3, np.uint8))
+    shown.watch()
+    assert shown.is_free()
+    held = shown.observed[:1]
+    assert not shown.is_free()
+    del held
+    assert shown.is_free()
+
+
 def test_worlds_that_others_have_stepped_are_refused():
     _, env = both(load_task("sand-pushing"), 3)
     env.reset(seed=1)
