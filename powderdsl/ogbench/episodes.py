@@ -26,7 +26,7 @@ from powderdsl.simulation.simulator import Simulator, World, compile
 from powderdsl.system.random import MASK, base_keys, mix, name_number
 from powderdsl.targets.cpp.program import PackedState
 from powderdsl.targets.torch.program import TorchProgram
-from powderdsl.tasks.compiled import Recycled
+from powderdsl.tasks.compiled import Rows
 from powderdsl.tasks.tensors.actions import Blocks, put_rows, put_worlds, take_worlds
 
 Numbers = NDArray[np.int64]
@@ -226,15 +226,6 @@ class Goal(NamedTuple):
     picture: Tensor
 
 
-class _Rows(Recycled):
-    """The rows of a batch of observations, uint8."""
-
-    def __init__(self, shape: tuple[int, ...]):
-        self.rows = np.empty(shape, np.uint8)
-        self._arrays = [self.rows]
-        self.watch()
-
-
 class Episodes:
     """A batch of episodes of one level. Environment i has the seed `seeds`[i]; its first episode has number 0.
 
@@ -276,7 +267,7 @@ class Episodes:
         self.world: World | None = None
         self._pictures = torch.zeros(batch, side, side, 6, dtype=torch.uint8, device=device)
         """The worlds' pictures, without action frames."""
-        self._memory: list[_Rows] = []
+        self._memory: list[Rows] = []
         """Of observations."""
         self.goal_ids = torch.zeros(batch, side, side, dtype=torch.uint8, device=device)
         self.goal_pictures = torch.zeros(batch, side, side, 3, dtype=torch.uint8, device=device)
@@ -424,9 +415,9 @@ class Episodes:
         frames, shown = self.program.frames(self.stage, *self._chosen[:, :2].T), self._pictures
         if shown.device.type != "cpu":
             return (shown.flatten(2) | torch.from_numpy(frames).to(shown.device)).view_as(shown)
-        memory = next(filter(_Rows.is_free, self._memory), None)
+        memory = next(filter(Rows.is_free, self._memory), None)
         if memory is None:
-            memory = _Rows((self.count, len(shown[0]), frames.shape[2]))
+            memory = Rows((self.count, len(shown[0]), frames.shape[2]), np.uint8)
             self._memory = [*self._memory[-3:], memory]
         np.bitwise_or(shown.flatten(2).numpy(), frames, out=memory.rows)
         return torch.from_numpy(memory.rows).view_as(shown)

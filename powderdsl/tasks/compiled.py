@@ -77,6 +77,15 @@ class Recycled:
         return self._references() == self._counts
 
 
+class Rows(Recycled):
+    """One array to reuse, such as observations."""
+
+    def __init__(self, shape: tuple[int, ...], dtype: Any):
+        self.rows = np.empty(shape, dtype)
+        self._arrays = [self.rows]
+        self.watch()
+
+
 class Results(Recycled):
     """The results of a step, one row per world: see `Results` in episodes.hpp.
 

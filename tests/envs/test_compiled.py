@@ -256,22 +256,12 @@ def test_results_that_nobody_holds_are_used_again():
     assert env._results is results
 
 
-def test_observations_of_mixed_laws_that_nobody_holds_are_used_again():
-    from powderdsl.envs.mixed import Shown
+def test_an_array_is_free_while_nobody_holds_it_or_a_view_of_it():
+    from powderdsl.tasks.compiled import Rows
 
-    shown = Shown(np.zeros(3, np.uint8))
-    shown.watch()
-    assert shown.is_free()
-    held = shown.observed[:1]
-    assert not shown.is_free()
+    memory = Rows((3,), np.uint8)
+    assert memory.is_free()
+    held = memory.rows[:1]
+    assert not memory.is_free()
     del held
-    assert shown.is_free()
-
-
-def test_worlds_that_others_have_stepped_are_refused():
-    _, env = both(load_task("sand-pushing"), 3)
-    env.reset(seed=1)
-    env.step([[0] * 5] * 3)
-    env.simulator.step(env.episodes.world, reuse=True)
-    with pytest.raises(RuntimeError, match="reuse"):
-        env.step([[0] * 5] * 3)
+    assert memory.is_free()
