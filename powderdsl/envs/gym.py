@@ -206,7 +206,7 @@ class PowderEnv(Face, gymnasium.Env[Array, Any], EzPickle):
 
     def _info(self, info: Mapping[str, Any]) -> dict[str, Any]:
         returned, length = self.tensors.progress()
-        infos = {
+        infos: dict[str, Any] = {
             "success": bool(info["success"][0]),
             "world": int(info["world"][0]),
             "episode_return": returned,
