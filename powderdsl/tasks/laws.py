@@ -8,6 +8,7 @@ from itertools import permutations
 import torch
 from torch import Tensor
 
+from powderdsl.model.types import Ruleset
 from powderdsl.simulation.simulator import Simulator
 from powderdsl.tasks.task import Task
 
@@ -18,13 +19,18 @@ NUMBERS = ("down", "right", "inner", "outer")
 """The measurements of an experiment: the displacement of the square, and the amounts of both elements."""
 
 
+def tried_pairs(ruleset: Ruleset) -> Tensor:
+    """The ids of the square and of its surroundings in each experiment, int64 [pairs, 2]."""
+    return torch.tensor(list(permutations(sorted(element.id for element in ruleset.elements), 2)))
+
+
 def experiments(simulator: Simulator) -> Tensor:
     """The outcomes of experiments with every pair of elements, in the order of ids: uint8 [pairs · 4].
 
     127 or 128 means no change; 255 means a move by `STEPS` cells down or right, or twice the amount.
     """
-    pairs = list(permutations(sorted(element.id for element in simulator.ruleset.elements), 2))
-    inner, outer = torch.tensor(pairs).repeat_interleave(SAMPLES, 0).T
+    pairs = tried_pairs(simulator.ruleset)
+    inner, outer = pairs.repeat_interleave(SAMPLES, 0).T
     first = (SIDE - BLOCK) // 2
     ids = outer[:, None, None].repeat(1, SIDE, SIDE)
     ids[:, first : first + BLOCK, first : first + BLOCK] = inner[:, None, None]

@@ -21,7 +21,7 @@ from powderdsl.worldmodel.config import HERE, DataConfig, Machine
 from powderdsl.worldmodel.networks import without_actions
 from powderdsl.worldmodel.scores import Network, Score, elements_of, frequent, outcomes, score, still
 from powderdsl.worldmodel.training import Trained, check_slots, load_rules_of
-from powderdsl.worldmodel.worlds import Pairs, Recording, TaskWorlds, pairs_of, unseen_seeds
+from powderdsl.worldmodel.worlds import Pairs, Recording, TaskWorlds, inputs_of, pairs_of, unseen_seeds
 
 FIT_WORLDS = 64
 """Maximum number of training worlds to fit baselines on."""
@@ -79,10 +79,11 @@ class Tested:
 def ahead(predict: Network, times: int) -> Network:
     """A network for `times` the number of steps, which is applied to its own predictions."""
 
-    def predicted(ids: torch.Tensor) -> torch.Tensor:
+    def predicted(inputs: torch.Tensor) -> torch.Tensor:
         for _ in range(times - 1):
-            ids = predict(ids).argmax(1).to(torch.uint8)
-        return predict(ids)
+            ids = predict(inputs).argmax(1).to(torch.uint8)
+            inputs = ids if inputs.ndim == 3 else torch.stack([ids, inputs[:, 1]], 1)  # laws stay
+        return predict(inputs)
 
     return predicted
 
@@ -248,7 +249,7 @@ def strips(predict: Network, worlds: TaskWorlds, *, step: int, times: int = 1, a
     """
     seeds = unseen_seeds(1, len(worlds.names)).to(worlds.device)
     world = worlds.later(worlds.start(seeds), after)
-    predicted = ahead(predict, times)(world.ids).argmax(1).to(torch.uint8)
+    predicted = ahead(predict, times)(inputs_of(world)).argmax(1).to(torch.uint8)
     truth = worlds.later(world, step * times).ids
     three = [ids.cpu().numpy() for ids in (world.ids, truth, predicted)]
     return [Strip(name, *(ids[n] for ids in three)) for n, name in enumerate(worlds.names)]

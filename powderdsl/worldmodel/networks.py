@@ -23,6 +23,7 @@ from torch.nn import functional as F
 from powderdsl.diagnostics import suggest
 from powderdsl.experiments.runs import Checkpoint, reporting_misfits
 from powderdsl.system.writing import failure
+from powderdsl.tasks.laws import NUMBERS
 from powderdsl.worldmodel.config import TrainConfig
 
 SIDES = 4
@@ -55,6 +56,11 @@ class ActionChannels:
     def channels(self) -> int:
         return self.slots + (self.observed - 1 + 4 * self.actions if self.observed else 0)
 
+    @property
+    def planes(self) -> tuple[int, ...]:
+        """The dimensions of inputs between their number and their rows."""
+        return (self.observed + 3,) if self.observed else ()
+
     def __call__(self, inputs: Tensor) -> Tensor:
         ids, others = inputs, list[Tensor]()
         if self.observed:
@@ -69,6 +75,31 @@ class ActionChannels:
         return torch.cat([elements, *others], 1)
 
 
+@dataclass(frozen=True)
+class LawChannels:
+    """From elements and laws, uint8 [B, 2, H, W] of `worlds.inputs_of`, to channels, float32 [B, channels, H, W].
+
+    These are one-hot elements, and what the cell's element does amid each other one, −1 to 1.
+    """
+
+    slots: int
+    planes = (2,)
+
+    @property
+    def channels(self) -> int:
+        return self.slots * (1 + len(NUMBERS))
+
+    def __call__(self, inputs: Tensor) -> Tensor:
+        ids, count = inputs[:, 0].long(), self.slots * len(NUMBERS)
+        table = inputs[:, 1].flatten(1)[:, : self.slots * count].unflatten(1, (self.slots, count))
+        laws = table.gather(1, ids.flatten(1)[..., None].expand(-1, -1, count)).float() / 127.5 - 1
+        elements = F.one_hot(ids, self.slots).float()
+        return torch.cat([elements, laws.view(*ids.shape, count)], 3).permute(0, 3, 1, 2)
+
+
+Encoder = ActionChannels | LawChannels
+
+
 def without_actions(inputs: Tensor) -> Tensor:
     """Inputs without an action: uint8 [B, C + 3, H, W]."""
     blanked = inputs.clone()
@@ -79,7 +110,7 @@ def without_actions(inputs: Tensor) -> Tensor:
 class Encoded(nn.Module):
     """A network on ids that encodes its inputs for a network on channels."""
 
-    def __init__(self, encoder: ActionChannels, network: nn.Module):
+    def __init__(self, encoder: Encoder, network: nn.Module):
         super().__init__()
         self.encoder, self.network = encoder, network
 
@@ -172,7 +203,7 @@ class CustomNetwork:
     name: str
     make: Callable[[int, int], Any]
 
-    def build(self, encoder: ActionChannels, seed: int) -> Encoded:
+    def build(self, encoder: Encoder, seed: int) -> Encoded:
         """A network whose random weights depend only on the seed.
 
         Raises CompileError (PD625) if it is not a module or cannot be created.
@@ -184,14 +215,13 @@ class CustomNetwork:
                 raise TypeError(f"it must return a torch.nn.Module, found {type(network).__name__}")
         return Encoded(encoder, network)
 
-    def check(self, encoder: ActionChannels, size: tuple[int, int], seed: int) -> None:
+    def check(self, encoder: Encoder, size: tuple[int, int], seed: int) -> None:
         """Check, on two worlds of a size, the shape of a network's logits, and that it can be trained.
 
         Raises CompileError (PD625).
         """
         network = self.build(encoder, seed)
-        state = (encoder.observed + 3,) if encoder.observed else ()
-        inputs = torch.zeros(2, *state, *size, dtype=torch.uint8)
+        inputs = torch.zeros(2, *encoder.planes, *size, dtype=torch.uint8)
         expected = [2, encoder.slots, *size]
         with torch.random.fork_rng(devices=[]), _reporting_user_errors(self.name, "cannot be trained"):
             logits: Any = network(inputs)
@@ -247,20 +277,20 @@ def _reporting_user_errors(name: str, what: str) -> Iterator[None]:
 # Networks of runs
 
 
-def encoder_of(config: TrainConfig, slots: int) -> ActionChannels:
+def encoder_of(config: TrainConfig, slots: int) -> Encoder:
     if config.recorded is None:
-        return ActionChannels(slots)
+        return LawChannels(slots) if config.data.observation == "laws" else ActionChannels(slots)
     return ActionChannels(slots, len(config.recorded.channels), config.recorded.actions)
 
 
 def network_of(config: TrainConfig, slots: int, own: nn.Module | CustomNetwork | None) -> nn.Module:
-    """The given network, or the paper's, which encodes worlds without actions itself."""
+    """The given network, or the paper's, which encodes ids alone itself."""
     encoder = encoder_of(config, slots)
     if isinstance(own, CustomNetwork):
         return own.build(encoder, config.seed)
     if own is not None:
         return own
-    if config.recorded is None:
+    if not encoder.planes:
         return fresh_unet(slots, config.width, config.seed)
     return Encoded(encoder, fresh_unet(slots, config.width, config.seed, encoder.channels))
 

@@ -45,7 +45,7 @@ from powderdsl.tasks.shipped import load_task
 from powderdsl.worldmodel.config import HERE, DataConfig, Machine, TrainConfig
 from powderdsl.worldmodel.networks import CustomNetwork, encoder_of, fit_weights, network_of
 from powderdsl.worldmodel.scores import score
-from powderdsl.worldmodel.worlds import Pairs, TaskWorlds, Worlds, pairs_of, validation_pairs
+from powderdsl.worldmodel.worlds import Pairs, TaskWorlds, Worlds, inputs_of, pairs_of, validation_pairs
 
 if TYPE_CHECKING:
     from powderdsl.worldmodel.worlds import Recording
@@ -58,7 +58,7 @@ _BATCH, _FIRST = 0x57A7, 0x0FF5
 
 
 class Replay:
-    """A buffer of pairs: `starts` and `ends`, uint8 [size, H, W], for the iteration `iteration`.
+    """A buffer of pairs: `starts`, uint8 [size, H, W] or [size, 2, H, W], and `ends`, [size, H, W], for `iteration`.
 
     Its contents, and the pairs of a batch, are functions of the configuration, the seed and the iteration. So a
     checkpoint does not need to store it: `advance_to` recreates it exactly.
@@ -86,15 +86,15 @@ class Replay:
         self._key = int(mix(keys[0] ^ keys[1])[0])
         first = int((keys[0, 1] << 32 | keys[1, 1]) & (2**63 - 1))
         self._first = 0 if self.all_fit else first % config.states
-        shape = (self.size, *worlds.size)
+        shape = (3 if config.observation == "laws" else 2, self.size, *worlds.size)
         if store == "auto":
-            store = "disk" if 2 * math.prod(shape) > memory_of(self.device) // 2 else "memory"
+            store = "disk" if math.prod(shape) > memory_of(self.device) // 2 else "memory"
         if store == "memory":
-            self.starts, self.ends = torch.zeros(2, *shape, dtype=torch.uint8, device=self.device)
+            pairs = torch.zeros(shape, dtype=torch.uint8, device=self.device)
         else:
             with TemporaryFile(dir=folder) as file:  # mapped memory outlives the file
-                pairs = np.memmap(file, dtype=np.uint8, mode="w+", shape=(2, *shape))
-            self.starts, self.ends = torch.from_numpy(pairs)
+                pairs = torch.from_numpy(np.memmap(file, dtype=np.uint8, mode="w+", shape=shape))
+        self.starts, self.ends = pairs[:-1].movedim(0, 1) if len(pairs) == 3 else pairs[0], pairs[-1]
         self.iteration = -1
         self._live: Any = None
 
@@ -117,14 +117,14 @@ class Replay:
             if moment == 0 or self._live is None:
                 filled = -(-self.size // config.pairs)
                 self._live = self.worlds.start(self._seeds(filled + turn * many, many))
-            start = self._live.ids
+            start = inputs_of(self._live)
             self._live = self.worlds.later(self._live, config.steps)
             place = self.size + self.iteration * many + torch.arange(many)
             self._write(place % self.size, (start, self._live.ids))
         self.iteration += 1
 
     def batch(self, iteration: int, count: int) -> Pairs:
-        """The pairs of an iteration's batch, drawn uniformly: uint8 [count, H, W] each, on the buffer's device."""
+        """The pairs of an iteration's batch, drawn uniformly: uint8 [count, …] each, on the buffer's device."""
         key = mix(torch.tensor((self._key + iteration * 0x9E3779B1) & MASK))
         drawn = mix((mix((key + torch.arange(count) * 0x85EBCA6B) & MASK) + (iteration >> 16)) & MASK)
         chosen = ((drawn * self.size) >> 32).to(self.starts.device)

@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 import torch
 from torch import Tensor
+from torch.nn import functional as F
 
 from powderdsl.compiler import load
 from powderdsl.datasets.manifest import changed_params, choice_names
@@ -28,7 +29,8 @@ from powderdsl.model.types import Ruleset
 from powderdsl.simulation.programs import starting_backend
 from powderdsl.system.settings import fingerprint
 from powderdsl.system.writing import failure
-from powderdsl.tasks.episodes import Episodes, compile_task
+from powderdsl.tasks.episodes import Episodes, TaskProgram, compile_task
+from powderdsl.tasks.laws import NUMBERS, tried_pairs
 from powderdsl.tasks.shipped import check_split, load_task, shipped_tasks
 from powderdsl.tasks.task import BLOW, NO_CHANGE, NOTHING, Drawing, Generator, Goal, Stamp, Task
 from powderdsl.tasks.tensors.actions import cells_of
@@ -45,7 +47,7 @@ VALIDATION_WORLDS = 64
 """Number of validation worlds, each used at one time."""
 
 Pairs = tuple[Tensor, Tensor]
-"""Start and end, element ids uint8 [B, H, W] each."""
+"""Start, of `inputs_of`, and end, element ids uint8 [B, H, W]."""
 
 
 class Worlds(Protocol):
@@ -69,6 +71,8 @@ class Batch:
     """Worlds with one seed each, possibly under different rulesets: their numbers and episodes by ruleset."""
 
     parts: tuple[tuple[Tensor, Episodes], ...]
+    laws: Tensor | None = None
+    """If networks see them, bytes of each world's laws, uint8 [B, H, W]: see `law_plane`."""
 
     @property
     def ids(self) -> Tensor:
@@ -77,6 +81,25 @@ class Batch:
             return self.parts[0][1].world.ids
         order = torch.cat([numbers for numbers, _ in self.parts]).argsort()
         return torch.cat([episodes.world.ids for _, episodes in self.parts])[order]
+
+
+def law_plane(program: TaskProgram, episodes: Episodes, slots: int) -> Tensor:
+    """The laws of a ruleset as bytes of cells, uint8 [H, W].
+
+    Bytes 4·(slots·a + b) to … + 3 are what a square of element a did amid element b (`tasks.laws.experiments`).
+    """
+    pairs = tried_pairs(program.task.ruleset)
+    numbers = program.law_bytes(episodes)[0, : len(NUMBERS) * len(pairs)].view(len(pairs), len(NUMBERS))
+    table = torch.full((slots, slots, len(NUMBERS)), 127, dtype=torch.uint8, device=numbers.device)
+    table[pairs[:, 0], pairs[:, 1]] = numbers
+    height, width = program.task.size
+    return F.pad(table.flatten(), (0, height * width - table.numel())).view(height, width)
+
+
+def inputs_of(world: Any) -> Tensor:
+    """What networks see of worlds: ids, uint8 [B, H, W]; or ids and bytes of laws, uint8 [B, 2, H, W]."""
+    laws = getattr(world, "laws", None)
+    return world.ids if laws is None else torch.stack([world.ids, laws], 1)
 
 
 class TaskWorlds:
@@ -104,7 +127,7 @@ class TaskWorlds:
         rules = load(config.rules, params=config.params, palette=palette) if config.rules else task.ruleset
         self.missing: tuple[Missing, ...] = ()
         if not laws.rulesets:
-            if config.rulesets:
+            if config.rulesets or config.observation == "laws":
                 raise failure("PD801", f"the split {config.split} of {task.name} has no `rulesets`")
             check_data(config, task, rules)
             task, self.missing = watch(task, config.split, rules, config.only, partly=partly)
@@ -114,6 +137,10 @@ class TaskWorlds:
             # Compiling many rulesets would take longer than running them.
             machine = {**machine, "backend": starting_backend(str(machine.get("device", "cpu")))}
         self.config, self.rules, self.size = config, rules, task.size
+        self._slots = len(palette or ()) or 1 + max(element.id for element in rules.elements)
+        if config.observation == "laws" and len(NUMBERS) * self._slots**2 > task.size[0] * task.size[1]:
+            what = f"{len(NUMBERS) * self._slots**2} cells, to show the laws of {self._slots} elements"
+            raise failure("PD801", f"the worlds of {task.name} are too small: they need {what}")
         split = task.split(config.split)
         self.names = tuple(variant.name for variant in split.variants)
         """The names of the variants: seed s gives variant s mod their number."""
@@ -125,14 +152,21 @@ class TaskWorlds:
 
     def start(self, seeds: Tensor) -> Batch:
         """The worlds of seeds, int64 [B]."""
-        return Batch(tuple((places, own.start(seeds[places])) for places, own in self._program.apart(seeds)))
+        parts, laws = [], torch.zeros(len(seeds), *self.size, dtype=torch.uint8, device=self.device)
+        shows = self.config.observation == "laws"
+        for places, own in self._program.apart(seeds):
+            episodes = own.start(seeds[places])
+            parts.append((places, episodes))
+            if shows:
+                laws[places] = law_plane(own, episodes, self._slots)
+        return Batch(tuple(parts), laws if shows else None)
 
     def later(self, world: Batch, steps: int) -> Batch:
         def stepped(episodes: Episodes) -> Episodes:
             now = episodes.world
             return replace(episodes, world=now.sim.step(now, steps, params=episodes.params or None))
 
-        return Batch(tuple((numbers, stepped(episodes)) for numbers, episodes in world.parts))
+        return replace(world, parts=tuple((numbers, stepped(episodes)) for numbers, episodes in world.parts))
 
 
 def check_data(config: DataConfig, task: Task, rules: Ruleset) -> None:
@@ -151,7 +185,7 @@ def pairs_of(worlds: Worlds, seeds: Tensor, steps: int, pairs: int) -> Iterator[
     """The pairs of some worlds in the order of time: `pairs` batches of one pair per world."""
     world = worlds.start(seeds)
     for _ in range(pairs):
-        start = world.ids
+        start = inputs_of(world)
         world = worlds.later(world, steps)
         yield start, world.ids
 

@@ -8,8 +8,11 @@ import pytest
 import torch
 
 import powderdsl
+from powderdsl.tasks.laws import experiments, tried_pairs
 from powderdsl.worldmodel import DataConfig, Machine, TaskWorlds, TrainConfig, evaluate, load_trained, train
 from powderdsl.worldmodel.evaluation import ahead, unseen_worlds
+from powderdsl.worldmodel.networks import LawChannels
+from powderdsl.worldmodel.worlds import inputs_of
 
 LAWS = """
 task: drawn
@@ -76,3 +79,38 @@ def test_a_network_predicts_several_times_its_steps() -> None:
     ids = torch.tensor([[[0, 3], [4, 1]]], dtype=torch.uint8)
     assert ahead(rise, 1)(ids).argmax(1).tolist() == [[[1, 4], [0, 2]]]
     assert ahead(rise, 3)(ids).argmax(1).tolist() == [[[3, 1], [2, 4]]]
+
+
+@pytest.mark.parametrize("store", ["memory", "disk"])
+def test_a_model_sees_what_each_element_does_amid_others(drawn: str, tmp_path: Path, store: str) -> None:
+    large = tmp_path / "large.yaml"
+    large.write_text(
+        Path(drawn).read_text(encoding="utf-8").replace("[14, 18]", "[28, 28]"), encoding="utf-8"
+    )
+    data = DataConfig(str(large), states=12, steps=2, pairs=2, capacity=24, refresh=1, observation="laws")
+    config = TrainConfig(data, width=4, iterations=3, batch=4)
+    machine = Machine(backend="torch", store=store)
+    trained = load_trained(train(config, tmp_path / "run", machine=machine))
+    slots = len(trained.palette)
+    worlds = unseen_worlds(trained, split="train", machine=machine)
+    inputs = inputs_of(worlds.start(torch.arange(4)))
+    assert inputs.shape == (4, 2, 28, 28)
+    channels = LawChannels(slots)(inputs)
+    assert channels.shape == (4, 5 * slots, 28, 28)
+    assert torch.equal(channels[:, :slots].argmax(1), inputs[:, 0].long())
+    rules = powderdsl.load("core+water+fire+lava", palette=trained.palette)
+    outcomes = experiments(powderdsl.compile(rules, backend="torch")).view(-1, 4).float() / 127.5 - 1
+    for (inner, outer), numbers in zip(tried_pairs(rules).tolist(), outcomes, strict=True):
+        cells = (inputs[0, 0] == inner).nonzero()[:1]
+        for row, column in cells.tolist():
+            first = slots + 4 * outer
+            assert torch.allclose(channels[0, first : first + 4, row, column], numbers)
+    assert not torch.equal(inputs[0, 1], inputs[1, 1])  # one of them has sand
+    near, far = (evaluate(trained, split="test", worlds=4, times=times, machine=MACHINE) for times in (1, 3))
+    assert near.mean("model") != far.mean("model") > 0
+
+
+def test_laws_need_rulesets_and_room(drawn: str) -> None:
+    for task, why in (("world-model", "has no `rulesets`"), (drawn, "they need 676 cells")):
+        with pytest.raises(powderdsl.CompileError, match=why):
+            TaskWorlds(DataConfig(task, observation="laws"), backend="torch")
