@@ -264,7 +264,7 @@ def names_in_file(text: str, span: Span, reporter: Reporter) -> list[str] | None
     Returns None after reporting a path outside that folder (PD112) or an unknown name (PD304).
     """
     names: list[str] = []
-    known, parts = shipped_rules(), text.split("+")
+    parts = text.split("+")
     for part in parts:
         head = part.split("-")[0]
         if is_universe(part):
@@ -272,7 +272,7 @@ def names_in_file(text: str, span: Span, reporter: Reporter) -> list[str] | None
         elif is_path(part):
             path = path_beside(part, span, reporter)
             names += [str(path)] if path is not None else []
-        elif head in known:
+        elif head in shipped_rules():
             names.append(part)
         else:
             _report_unknown(head, span, reporter)
