@@ -220,8 +220,8 @@ class _Loop(CellValues[str]):
                 continue
             stores.append(f"*(Fu*)(o{name} + x) = {value};")
             if name not in self.rows.rings:
-                counts.append(f"I n{name} = {{}};")
-                stores.append(f"n{name} |= (I)blend(inside, {value}, splatf(0));")
+                counts.append(f"U n{name} = {{}};")
+                stores.append(f"n{name} |= (U)blend(inside, {value}, splatf(0));")
                 live = f"const bool some = any((V)(n{name} + n{name}));"
                 lives.append(f"{{ {live} v{name}.live[base + y] = some; some{name} |= some; }}")
         yield PLACE
