@@ -16,7 +16,16 @@ from powderdsl.targets.cpp.build import NoCompiler, find_compiler
 from tests.cli.commands import powderdsl
 
 DOCS = Path(__file__).parents[2] / "docs" / "export.md"
-FLAGS = ("-std=c++17", "-O0", "-march=native", "-ffp-contract=off", "-fPIC", "-w")
+FLAGS = (
+    "-std=c++17",
+    "-O0",
+    "-march=native",
+    "-ffp-contract=off",
+    "-fPIC",
+    "-w",
+    "-fsanitize=undefined",
+    "-fno-sanitize-recover=all",
+)
 WORLDS, ENVIRONMENTS = 16, 5
 
 pytestmark = pytest.mark.usefixtures("torch")
@@ -55,7 +64,7 @@ def test_the_programs_of_the_docs_run(sand_pushing):
     for compiler in [name for name in ("gcc", "clang") if shutil.which(name)]:
         strict = [compiler, "-O1", "-Wall", "-Werror", "-std=c99"]
         subprocess.run([*strict, "-c", "binding.c"], cwd=sand_pushing, check=True)
-        linked = ["program.c", "env.o", "-lstdc++", "-lpthread", "-lm", "-o", "program"]
+        linked = ["program.c", "env.o", "-lstdc++", "-lpthread", "-lm", "-lubsan", "-o", "program"]
         subprocess.run([*strict, *linked], cwd=sand_pushing, check=True)
         run = subprocess.run(["./program"], cwd=sand_pushing, check=True, capture_output=True, text=True)
         assert re.fullmatch(r"3200 steps, 32 episodes, return -?[0-9.]+\n", run.stdout)
@@ -78,7 +87,7 @@ def test_c_does_the_same_as_python(request, tmp_path, task, observation, actions
         folder = request.getfixturevalue("sand_pushing")
     else:
         compiled_environment(folder, task, *(f"--{name}={value}" for name, value in how.items()))
-    linked = [*cpp_compiler(), "-shared", "env.o", "-o", "env.so", "-lpthread"]
+    linked = [*cpp_compiler(), "-shared", "env.o", "-o", "env.so", "-lpthread", "-lubsan"]
     subprocess.run(linked, cwd=folder, check=True)
     library = ctypes.CDLL(str(folder / "env.so"))
     library.powder_new.restype, library.powder_step.restype = ctypes.c_void_p, ctypes.c_int64
