@@ -111,6 +111,6 @@ def test_a_model_sees_what_each_element_does_amid_others(drawn: str, tmp_path: P
 
 
 def test_laws_need_rulesets_and_room(drawn: str) -> None:
-    for task, why in (("world-model", "has no `rulesets`"), (drawn, "they need 676 cells")):
+    for task, why in (("world-model", "world-model has no `rulesets`"), (drawn, "they need 676 cells")):
         with pytest.raises(powderdsl.CompileError, match=why):
             TaskWorlds(DataConfig(task, observation="laws"), backend="torch")
