@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import ctypes
+import importlib.util
 import re
 import shutil
 import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -80,8 +82,6 @@ def test_the_programs_of_the_docs_run(sand_pushing):
     ],
 )
 def test_c_does_the_same_as_python(request, tmp_path, task, observation, actions):
-    from powderdsl.envs.compiled import CompiledEnv
-
     how, folder = {"observation": observation, "actions": actions}, tmp_path
     if (task, observation, actions) == ("sand-pushing", "ids", "multidiscrete"):
         folder = request.getfixturevalue("sand_pushing")
@@ -90,23 +90,82 @@ def test_c_does_the_same_as_python(request, tmp_path, task, observation, actions
     linked = [*cpp_compiler(), "-shared", "env.o", "-o", "env.so", "-lpthread", "-lubsan"]
     subprocess.run(linked, cwd=folder, check=True)
     library = ctypes.CDLL(str(folder / "env.so"))
-    library.powder_new.restype, library.powder_step.restype = ctypes.c_void_p, ctypes.c_int64
+    pointer, address = ctypes.c_void_p, ctypes.c_void_p
+    library.powder_new.restype, library.powder_step.restype = pointer, ctypes.c_int64
+    library.powder_reset.argtypes = pointer, ctypes.c_uint64, address
+    library.powder_step.argtypes, library.powder_free.argtypes = [pointer] + [address] * 5, [pointer]
 
     def at(array: Any) -> ctypes.c_void_p:
         return ctypes.c_void_p(array.ctypes.data)
+
+    assert_does_the_same(library, at, task, **how)
+
+
+class WasmLibrary:
+    """The functions of a WebAssembly module. Arrays are copied into its memory before each call, and back."""
+
+    def __init__(self, path: Path):
+        import wasmtime
+
+        engine = wasmtime.Engine()
+        self.store, linker = wasmtime.Store(engine), wasmtime.Linker(engine)
+        self.store.set_wasi(wasmtime.WasiConfig())
+        linker.define_wasi()
+        module = linker.instantiate(self.store, wasmtime.Module.from_file(engine, str(path)))
+        self.functions, self.places = module.exports(self.store), {}
+        self.functions["_initialize"](self.store)
+
+    def __getattr__(self, name: str) -> Any:
+        return lambda *values: self.call(name, values)
+
+    def call(self, name: str, values: tuple[Any, ...]) -> Any:
+        memory, arrays = (
+            self.functions["memory"],
+            [value for value in values if isinstance(value, np.ndarray)],
+        )
+        for array in arrays:
+            if id(array) not in self.places:
+                self.places[id(array)] = self.functions["malloc"](self.store, array.nbytes), array
+            memory.write(self.store, array.tobytes(), self.places[id(array)][0])
+        words = [self.places[id(value)][0] if isinstance(value, np.ndarray) else value for value in values]
+        result = self.functions[name](self.store, *words)
+        for array in arrays:
+            at = self.places[id(array)][0]
+            array[...] = np.frombuffer(memory.read(self.store, at, at + array.nbytes), array.dtype).reshape(
+                array.shape
+            )
+        return result
+
+
+def test_webassembly_does_the_same_as_python(sand_pushing):
+    """With the command of the docs; with Debian's clang++ where there is no ziglang."""
+    (words,) = re.findall(r"^(python -m ziglang.*?env\.wasm)$", DOCS.read_text("utf-8"), re.S | re.M)
+    command = [sys.executable, *words.replace("\\\n", " ").split()[1:]]
+    if importlib.util.find_spec("ziglang") is None:
+        if not (shutil.which("clang++") and Path("/usr/include/wasm32-wasi").is_dir()):
+            pytest.skip("no compiler for WebAssembly: pip install ziglang")
+        command[:6] = ["clang++", "--target=wasm32-wasi"]
+    subprocess.run(command, cwd=sand_pushing, check=True)
+    library = WasmLibrary(sand_pushing / "env.wasm")
+    assert_does_the_same(library, lambda array: array, "sand-pushing", actions="multidiscrete")
+
+
+def assert_does_the_same(library: Any, at: Any, task: str, **how: Any) -> None:
+    """Assert that an exported environment does what a `CompiledEnv` does; `at` makes arguments of arrays."""
+    from powderdsl.envs.compiled import CompiledEnv
 
     env = CompiledEnv(task, ENVIRONMENTS, worlds=WORLDS, **how)
     first = env.reset(seed=3)[0].numpy()
     observed, flags = np.zeros_like(first), np.zeros((2, ENVIRONMENTS), np.bool_)
     rewards = np.zeros(ENVIRONMENTS, np.float32)
     results = at(observed), at(rewards), at(flags[0]), at(flags[1])
-    handle = ctypes.c_void_p(library.powder_new(ENVIRONMENTS))
-    library.powder_reset(handle, ctypes.c_uint64(3), at(observed))
+    handle = library.powder_new(ENVIRONMENTS)
+    library.powder_reset(handle, 3, at(observed))
     assert observed.tobytes() == first.tobytes()
     draws = np.random.default_rng(0)
     for _ in range(2 * env.max_episode_steps + 9):
         numbers = np.stack([draws.integers(0, most, ENVIRONMENTS) for most in env.action_nvec], 1)
-        wanted = env.step_arrays(numbers[:, 0] if actions == "discrete" else numbers)
+        wanted = env.step_arrays(numbers[:, 0] if env.action_form.kind == "discrete" else numbers)
         assert library.powder_step(handle, at(numbers), *results) == -1
         for name, mine, yours in zip(
             ("observations", "reward", "terminated", "truncated"),

@@ -111,10 +111,10 @@ static void free_context(Context* c) {
 }
 
 // Contexts wait here between calls: at most a few, of the grids used last.
-static std::mutex contexts_lock;
+static Mutex contexts_lock;
 static std::vector<Context*> contexts;
 static Context* borrow(const Grid& g) {
-  std::lock_guard<std::mutex> hold(contexts_lock);
+  Hold hold(contexts_lock);
   for (size_t i = 0; i < contexts.size(); i++)
     if (contexts[i]->g == g) {
       Context* c = contexts[i];
@@ -124,7 +124,7 @@ static Context* borrow(const Grid& g) {
   return new_context(g);
 }
 static void put_back(Context* c) {
-  std::lock_guard<std::mutex> hold(contexts_lock);
+  Hold hold(contexts_lock);
   contexts.push_back(c);
   if (contexts.size() > 16) {
     free_context(contexts.front());
@@ -231,9 +231,10 @@ static void run_group(Context& c, Batch& b, int number, long steps, const Clocks
   group.present = c.present;
 }
 
+#if !defined(__wasm__)
 // Threads that wait for work; the caller is one of them.
 struct Pool {
-  std::mutex lock;
+  Mutex lock;
   std::condition_variable wake, done;
   std::vector<std::thread> threads;
   std::function<void(int)> job;
@@ -251,13 +252,13 @@ struct Pool {
         mine = job;
       }
       mine(id);
-      std::lock_guard<std::mutex> hold(lock);
+      Hold hold(lock);
       if (--running == 0) done.notify_one();
     }
   }
   void run(int count, std::function<void(int)> task) {
     {
-      std::lock_guard<std::mutex> hold(lock);
+      Hold hold(lock);
       while ((int)threads.size() < count - 1) {
         int id = (int)threads.size() + 1;
         threads.emplace_back([this, id] { work(id); });
@@ -274,13 +275,14 @@ struct Pool {
     done.wait(hold, [&] { return running == 0; });
   }
 };
-static std::mutex pool_use;
+static Mutex pool_use;
 static Pool& pool() {  // never destroyed: its threads may outlive main
   static Pool* p = new Pool();
   static pid_t owner = getpid();
   if (getpid() != owner) p = new Pool(), owner = getpid();  // a fork has none of its parent's threads
   return *p;
 }
+#endif
 
 // Bit `bit` of the cells of a word. Eight bytes at a time: a product moves their lowest bits into one byte.
 template <class T> ALWAYS Word word_of_cells(const T* cell, int count, int bit) {
@@ -521,8 +523,13 @@ API void* pd_run(void* batch, int copy, int64_t steps, int threads, const u64* s
     for (int n; (n = next++) < (int)b.groups.size();) run_group(*c, b, n, steps, k, planes, reals);
     put_back(c);
   };
-  if (count == 1) return task(0), batch;
-  std::lock_guard<std::mutex> hold(pool_use);
-  pool().run(count, task);
+#if !defined(__wasm__)
+  if (count > 1) {
+    Hold hold(pool_use);
+    pool().run(count, task);
+    return batch;
+  }
+#endif
+  task(0);
   return batch;
 }

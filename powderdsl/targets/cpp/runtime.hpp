@@ -87,7 +87,7 @@ template <class T> static T* aligned(size_t count) {
 }
 // Buffers of batches that are gone are used again: fresh memory from the system costs more than a step.
 template <class T> struct Spare {
-  std::mutex lock;
+  Mutex lock;
   size_t size = 0;
   std::vector<T*> waiting;
 };
@@ -96,7 +96,7 @@ inline Spare<Field> spare_fields;
 static void release(Plane* p) { free(p->data); delete p; }
 static void release(Field* f) { free(f->data); free(f->live); delete f; }
 template <class T> static T* reuse(Spare<T>& spare, size_t size) {
-  std::lock_guard<std::mutex> hold(spare.lock);
+  Hold hold(spare.lock);
   if (spare.size != size) {
     for (T* t : spare.waiting) release(t);
     spare.waiting.clear();
@@ -109,7 +109,7 @@ template <class T> static T* reuse(Spare<T>& spare, size_t size) {
 }
 template <class T> static void drop(Spare<T>& spare, T* t, size_t size, size_t most) {
   {
-    std::lock_guard<std::mutex> hold(spare.lock);
+    Hold hold(spare.lock);
     if (spare.size == size && spare.waiting.size() < most) return spare.waiting.push_back(t);
   }
   release(t);

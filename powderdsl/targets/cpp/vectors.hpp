@@ -6,16 +6,26 @@
 #include <algorithm>
 #include <atomic>
 #include <cmath>
-#include <condition_variable>
 #include <cstdint>
 #include <cstdlib>
 #include <cstring>
 #include <ctime>
 #include <functional>
 #include <limits>
+#include <vector>
+#if !defined(__wasm__)
+#include <condition_variable>
 #include <mutex>
 #include <thread>
-#include <vector>
+typedef std::mutex Mutex;
+typedef std::lock_guard<std::mutex> Hold;
+#else  // has one thread
+#define CLOCK_THREAD_CPUTIME_ID CLOCK_MONOTONIC
+struct Mutex {};
+struct Hold {
+  Hold(Mutex&) {}
+};
+#endif
 #if defined(__SSE2__)
 #include <immintrin.h>
 #endif
