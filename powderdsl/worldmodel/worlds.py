@@ -128,9 +128,7 @@ class TaskWorlds:
         self.missing: tuple[Missing, ...] = ()
         if not laws.rulesets:
             if config.rulesets or config.observation == "laws":
-                raise failure(
-                    "PD801", f"{task.name} has no `rulesets` in {config.split}, as universe-model has"
-                )
+                raise failure("PD801", f"{task.name} has no `rulesets` in {config.split}; universe-model has")
             check_data(config, task, rules)
             task, self.missing = watch(task, config.split, rules, config.only, partly=partly)
         elif config.rules or config.only:
