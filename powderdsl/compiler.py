@@ -22,7 +22,7 @@ from powderdsl.syntax.sources import OPEN, path_beside, read_source, shipped, sh
 from powderdsl.system.cache import Memo, collection_paused, persistent
 from powderdsl.system.reading import inside, is_path
 from powderdsl.system.writing import failure
-from powderdsl.universes import is_universe, universe_source
+from powderdsl.universes import is_universe, universe_seed, universe_source
 
 if TYPE_CHECKING:
     from powderdsl.ir.bits import Segment
@@ -268,7 +268,7 @@ def names_in_file(text: str, span: Span, reporter: Reporter) -> list[str] | None
     for part in parts:
         head = part.split("-")[0]
         if is_universe(part):
-            names.append(part)
+            names += [part] if universe_seed(_without(part)[0], span, reporter) is not None else []
         elif is_path(part):
             path = path_beside(part, span, reporter)
             names += [str(path)] if path is not None else []

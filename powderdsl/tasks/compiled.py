@@ -67,14 +67,11 @@ class Recycled:
 
     def watch(self) -> None:
         """Count the current references, those of this object. Not for `__init__`, whose caller holds its arguments."""
-        self._counts = self._references()
-
-    def _references(self) -> list[int]:
-        return [*map(getrefcount, self._arrays)]
+        self._counts = [*map(getrefcount, self._arrays)]
 
     def is_free(self) -> bool:
-        """Return True if an array or a view of it has no other references."""
-        return self._references() == self._counts
+        """Return True if no array and no view of one has other references."""
+        return [*map(getrefcount, self._arrays)] == self._counts
 
 
 class Rows(Recycled):

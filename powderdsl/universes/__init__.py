@@ -21,13 +21,19 @@ def is_universe(word: str) -> bool:
     return word.startswith(PREFIX)
 
 
-def universe_source(word: str, span: Span | None, reporter: Reporter) -> Source | None:
-    """The pack with a name such as ``universe:7``; None after reporting PD304."""
+def universe_seed(word: str, span: Span | None, reporter: Reporter) -> int | None:
+    """The seed in a name such as ``universe:7``; None after reporting PD304."""
     number = word.removeprefix(PREFIX)
     seed = int(number) if re.fullmatch("[0-9]{1,10}", number) else -1
     if 0 <= seed <= MAX_SEED:
-        return Source(f"{PREFIX}{seed}", universe_text(seed))
+        return seed
     label = f"expected a number from 0 to {MAX_SEED:,} after the colon" if span else ""
     helps = [f"write a number from 0 to {MAX_SEED}, as in `{PREFIX}7`"]
     reporter.error("PD304", f"no universe `{number[:80]}`", span, label, helps=helps)
     return None
+
+
+def universe_source(word: str, span: Span | None, reporter: Reporter) -> Source | None:
+    """The pack with a name such as ``universe:7``; None after reporting PD304."""
+    seed = universe_seed(word, span, reporter)
+    return None if seed is None else Source(f"{PREFIX}{seed}", universe_text(seed))

@@ -93,8 +93,7 @@ class LawChannels:
         ids, count = inputs[:, 0].long(), self.slots * len(NUMBERS)
         table = inputs[:, 1].flatten(1)[:, : self.slots * count].unflatten(1, (self.slots, count))
         laws = table.gather(1, ids.flatten(1)[..., None].expand(-1, -1, count)).float() / 127.5 - 1
-        elements = F.one_hot(ids, self.slots).float()
-        return torch.cat([elements, laws.view(*ids.shape, count)], 3).permute(0, 3, 1, 2)
+        return torch.cat([F.one_hot(ids, self.slots), laws.view(*ids.shape, count)], 3).permute(0, 3, 1, 2)
 
 
 Encoder = ActionChannels | LawChannels

@@ -147,6 +147,10 @@ def test_tasks_name_universes_and_roles(tmp_path: Path) -> None:
     assert task.agent.choices[:3] == REAGENTS
     path.write_text(TASK.replace("universe:7", "universe:-7"), encoding="utf-8")
     assert "universe:7" in refusal(load_task, str(path))[0].helps[0]
+    path.write_text(TASK + "rulesets: [universe:0..1, universe:-7]\n", encoding="utf-8")
+    (error,) = refusal(load_task, str(path))
+    assert error.primary.span
+    assert error.primary.span.text == "universe:-7"
 
 
 TASK = """
