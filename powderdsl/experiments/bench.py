@@ -415,7 +415,7 @@ class _Subject:
         return self.program.load({name: values.numpy().copy() for name, values in self.world.state.items()})
 
     def kernels(self, steps: int) -> float | None:
-        """What torch's profiler sees of a step: a GPU's kernels and copies, or operators that call no others on the CPU."""
+        """A step as torch's profiler sees it: a GPU's kernels and copies, or operators that call no others on the CPU."""
         os.environ.setdefault("KINETO_LOG_LEVEL", "99")  # otherwise it writes on stderr
         from torch.profiler import ProfilerActivity, profile
 

@@ -98,7 +98,7 @@ def _apply(effects: Effects, values: list[Any], changes: list[Any]) -> None:
 
 
 def _setting(symbols: Composition) -> object:
-    """What concerns all files: the packs, what they need, and who lists them or leaves them out."""
+    """The results that concern all files: the packs, what they need, and who lists them or leaves them out."""
     needs = [(name, pack.side_multiple, symbols.names.needs[name]) for name, pack in symbols.packs.items()]
     members = [tuple(ruleset.members) for ruleset in symbols.ruleset.lineage]
     return needs, members, symbols.left_out, symbols.first_id

@@ -194,16 +194,16 @@ class Solver:
                         falsified[other] = level
                         reasons[other] = (false,)
                         queue.append(other)
-            for one, two in triples:
-                if falsified[two]:
-                    one, two = two, one
-                if falsified[one] and not falsified[two ^ 1]:
-                    if falsified[two]:
-                        conflict = (false, one, two)
+            for left, right in triples:
+                if falsified[right]:
+                    left, right = right, left
+                if falsified[left] and not falsified[right ^ 1]:
+                    if falsified[right]:
+                        conflict = (false, left, right)
                     else:
-                        falsified[two ^ 1] = level
-                        reasons[two ^ 1] = (false, one)
-                        queue.append(two ^ 1)
+                        falsified[right ^ 1] = level
+                        reasons[right ^ 1] = (false, left)
+                        queue.append(right ^ 1)
             kept: list[tuple[int, list[int]]] = []
             if watching:
                 watches[false] = kept

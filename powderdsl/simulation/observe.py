@@ -236,8 +236,8 @@ class Observer:
         if not isinstance(out, Tensor):
             raise TypeError(f"out must be a torch tensor, found {type(out).__name__}")
         if (tuple(out.shape), out.dtype, out.device) != (shape, dtype, self.device):
-            found = f"{out.dtype} {list(out.shape)} on {out.device}"
-            raise ValueError(f"out must be {dtype} {list(shape)} on {self.device}, found {found}")
+            kind = f"{out.dtype} {list(out.shape)} on {out.device}"
+            raise ValueError(f"out must be {dtype} {list(shape)} on {self.device}, found {kind}")
         if shape[0] and not (out[0].is_contiguous() and (shape[0] == 1 or out.stride(0) >= out[0].numel())):
             rule = "each world of out must be contiguous, and worlds must not overlap"
             raise ValueError(f"{rule}; found the strides {list(out.stride())}")

@@ -77,8 +77,8 @@ class World:
             array = getattr(self, name)
             fits = tuple(array.shape) == (batch,) and array.dtype == self.sim.kind.xp.int64
             if not fits or getattr(array, "device", None) != device:
-                found = f"{array.dtype} {list(array.shape)}"
-                raise ValueError(f"a world's {name} must be int64 [{batch}], found {found}")
+                kind = f"int64 [{batch}], found {array.dtype} {list(array.shape)}"
+                raise ValueError(f"a world's {name} must be {kind}")
 
     def __repr__(self) -> str:
         worlds, rows, columns = self.shape
@@ -424,8 +424,8 @@ class Simulator:
         try:
             return self.kind.xp.broadcast_to(array, target)
         except (RuntimeError, ValueError):
-            found = list(array.shape)
-            raise ValueError(f"{name} must have the shape {list(target)}, found {found}") from None
+            shapes = f"{list(target)}, found {list(array.shape)}"
+            raise ValueError(f"{name} must have the shape {shapes}") from None
 
     def paint(self, world: World, /, *, where: Any, element: str | None = None, **fields: Any) -> World:
         """Set the cells of a mask: to an element with fresh fields, to values of fields, or both.

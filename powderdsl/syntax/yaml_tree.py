@@ -80,8 +80,8 @@ Node = Scalar | Sequence | Mapping
 
 def parse_yaml(source: Source, reporter: Reporter) -> Node | None:
     """Parse a whole file; None after reporting mistakes."""
-    tree, found = _parsed(source)
-    for diagnostic in found:
+    tree, diagnostics = _parsed(source)
+    for diagnostic in diagnostics:
         reporter.add(diagnostic)
     return tree
 

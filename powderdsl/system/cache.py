@@ -142,7 +142,7 @@ def clear(folder: Path) -> list[Entry]:
 
 
 def fused_code(*, remove: bool = False) -> list[Entry]:
-    """What the backend `torch-fused` keeps in a folder of its own, as one entry; none if there is nothing."""
+    """The files that the backend `torch-fused` keeps in its own folder, as one entry; none if there is nothing."""
     folder = cache_folder("inductor")
     sizes = [path.lstat().st_size for path in folder.rglob("*") if path.is_file()]
     stored = [Entry(folder, "torch-fused", sum(sizes), folder.stat().st_mtime)] if sizes else []

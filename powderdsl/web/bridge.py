@@ -87,7 +87,7 @@ class Session:
             answer["ok"], remarks = False, error.diagnostics
         data = [diagnostic_data(remark, utf16=True) | {"text": render_text(remark)} for remark in remarks]
         texts = {name: text for name, text in packs.items() if name not in files and NAME.fullmatch(name)}
-        words = {name: found[0].kind for name, found in self.known.words.items()}
+        words = {name: meanings[0].kind for name, meanings in self.known.words.items()}
         return answer | {"diagnostics": data, "packs": list(packs), "texts": texts, "words": words}
 
     def complete(self, text: str, offset: int) -> list[dict[str, str]]:
@@ -97,8 +97,8 @@ class Session:
 
     def explain(self, text: str, offset: int) -> str:
         """The meaning of the word at a place of a file, as Markdown."""
-        found = explanation(Source("", text), offset, self.known)
-        return found[0] if found else ""
+        meaning = explanation(Source("", text), offset, self.known)
+        return meaning[0] if meaning else ""
 
     def format(self, text: str) -> str:
         """A file in the standard layout; unchanged if it cannot be read."""

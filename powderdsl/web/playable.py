@@ -80,9 +80,10 @@ def _start(task: Task, split: str, number: int) -> dict[str, Any]:
     """A start world, and what depends on its rules."""
     rules, made = task.ruleset, StartWorlds(task, split, ArrayKind()).make(np.array([number], np.int64))
     counted = [_counted(measure, [element.id for element in rules.elements]) for measure in _measures(task)]
-    names = {one.id: one.qualified for one in rules.elements} | {BLOW: "blow", NO_CHANGE: "nothing"}
+    names = {BLOW: "blow", NO_CHANGE: "nothing"}
+    names |= {element.id: element.qualified for element in rules.elements}
     fields = {key: np.asarray(values)[0] for key, (values, _) in made.fields.items()}
-    regions = {one[key] for one in counted for key in ("region", "let")} - {None}
+    regions = {count[key] for count in counted for key in ("region", "let")} - {None}
     cells = {key: np.asarray(made.regions[key])[0].astype("uint8") for key in sorted(regions)}
     return {
         "rules": task.rules[0].replace(":", "_"),

@@ -13,6 +13,7 @@ import json
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
+from math import prod
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
@@ -92,12 +93,11 @@ def law_plane(program: TaskProgram, episodes: Episodes, slots: int) -> Tensor:
     numbers = program.law_bytes(episodes)[0, : len(NUMBERS) * len(pairs)].view(len(pairs), len(NUMBERS))
     table = torch.full((slots, slots, len(NUMBERS)), 127, dtype=torch.uint8, device=numbers.device)
     table[pairs[:, 0], pairs[:, 1]] = numbers
-    height, width = program.task.size
-    return F.pad(table.flatten(), (0, height * width - table.numel())).view(height, width)
+    return F.pad(table.flatten(), (0, prod(program.task.size) - table.numel())).view(program.task.size)
 
 
 def inputs_of(world: Any) -> Tensor:
-    """What networks see of worlds: ids, uint8 [B, H, W]; or ids and bytes of laws, uint8 [B, 2, H, W]."""
+    """The part of worlds that networks see: ids, uint8 [B, H, W]; or ids and bytes of laws, uint8 [B, 2, H, W]."""
     laws = getattr(world, "laws", None)
     return world.ids if laws is None else torch.stack([world.ids, laws], 1)
 
@@ -138,7 +138,7 @@ class TaskWorlds:
             machine = {**machine, "backend": starting_backend(str(machine.get("device", "cpu")))}
         self.config, self.rules, self.size = config, rules, task.size
         self._slots = len(palette or ()) or 1 + max(element.id for element in rules.elements)
-        if config.observation == "laws" and len(NUMBERS) * self._slots**2 > task.size[0] * task.size[1]:
+        if config.observation == "laws" and len(NUMBERS) * self._slots**2 > prod(task.size):
             what = f"{len(NUMBERS) * self._slots**2} cells, to show the laws of {self._slots} elements"
             raise failure("PD801", f"the worlds of {task.name} are too small: they need {what}")
         split = task.split(config.split)

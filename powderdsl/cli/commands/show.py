@@ -262,7 +262,7 @@ def _laws(split: Split) -> Shown:
 
 
 def _step_text(task: Task, split: str) -> str:
-    """How an environment's step runs if there is a C++ compiler."""
+    """The text on how an environment's step runs if there is a C++ compiler."""
     from powderdsl.tasks.episodes import compile_task
 
     meter = compile_task(task, split=split).meter

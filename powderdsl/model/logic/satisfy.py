@@ -12,7 +12,7 @@ from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from functools import cached_property, lru_cache
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple, TypeVar, cast
 
 from powderdsl.model.operations import OPERATIONS, Bounds
 from powderdsl.model.types import FLAG, HERE, Expr, Field, Offset, Property, plus
@@ -73,7 +73,7 @@ class Facts:
 
     @cached_property
     def known(self) -> _Known:
-        """What equal facts share."""
+        """The part that equal facts share."""
         return _known(
             self.ids, tuple(self.properties.items()), tuple(self.fields.items()), self.side_multiple
         )
@@ -177,8 +177,8 @@ def _answered(
 ) -> tuple[Any, int]:
     """The answer to a question, and its work: editors ask the same after each key."""
     budget = Budget(most, most)
-    found = _ask(replace(known.facts, budget=budget), conditions, dict(lets), answer)
-    return found, most - max(budget.left, 0)
+    result = _ask(replace(known.facts, budget=budget), conditions, dict(lets), answer)
+    return result, most - max(budget.left, 0)
 
 
 def _answer(
@@ -188,10 +188,9 @@ def _answer(
     budget = facts.budget
     if budget.left < budget.most:
         return _ask(facts, conditions, lets, answer)
-    found, work = _answered(facts.known, tuple(conditions), tuple((lets or {}).items()), budget.most, answer)
+    result, work = _answered(facts.known, tuple(conditions), tuple((lets or {}).items()), budget.most, answer)
     budget.left -= work
-    result: Answer | None = found
-    return result
+    return cast("Answer | None", result)
 
 
 class _Term(NamedTuple):

@@ -204,7 +204,7 @@ class PackedState(OwnedBatch):
 
 
 class Places:
-    """Where generated code stores the pieces of a state: `homes` are the results of `Layout.home`, by slot."""
+    """The places of a state's pieces in generated code: `homes` are the results of `Layout.home`, by slot."""
 
     def __init__(self, layout: Layout, pieces: Mapping[str, tuple[Piece, ...]]):
         self.layout, self.pieces = layout, pieces

@@ -1,4 +1,4 @@
-"""What generated functions on bit planes call: neighbors, movements, draws, and floats where flags hold.
+"""Functions that generated functions on bit planes call: neighbors, movements, draws, and floats where flags hold.
 
 Words are int64, [..., H, B, K]: bit x % 64 of word x // 64 is column x. Bits beyond the last column are arbitrary. Planes of
 parameters, which all cells share, are broadcast. There are two libraries with the same operations:

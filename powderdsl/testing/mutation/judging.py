@@ -140,7 +140,7 @@ def warnings_of(diagnostics: tuple[Diagnostic, ...]) -> Counter[str]:
 
 
 def meaning_of(ruleset: Ruleset, memo: Memo) -> tuple[object, object]:
-    """What decides how a composition behaves, and what its tests and invariants say of that."""
+    """Everything that decides how a composition behaves, and what its tests and invariants say of that."""
     program, values = lower(ruleset, memo), [prop.values for prop in ruleset.properties]
     passes = [structure(pass_, places=False) for pass_ in program.passes]
     parts = program.slots, program.params, [p.default for p in ruleset.params], program.streams, passes

@@ -195,15 +195,15 @@ def distinguish(
 
     batches = [] if model is None else starts(model, replace(first.ruleset, streams=tuple(streams)))
     shown = [(some, sample, n) for sample, draws, steps in batches for some, n in (({}, steps), (draws, 1))]
-    found: list[tuple[tuple[str, ...], Draws, Start, int, Array]] = []
+    differences: list[tuple[tuple[str, ...], Draws, Start, int, Array]] = []
     for draws, sample, steps in chain(shown, _samples(first, second, focus, seed)):
         mine, theirs = states(draws, sample, steps)
         for compared in (slots, slots[:1]):
             if (steps_until := first_difference(mine, theirs, compared)).any():
-                found.append((compared, draws, sample, steps, steps_until))
-        if found and found[-1][0] == slots[:1]:
+                differences.append((compared, draws, sample, steps, steps_until))
+        if differences and differences[-1][0] == slots[:1]:
             break  # they show more than fields
-    for compared, draws, sample, steps, steps_until in sorted(found, key=lambda some: len(some[0]))[:1]:
+    for compared, draws, sample, steps, steps_until in sorted(differences, key=lambda some: len(some[0]))[:1]:
         soonest = int(np.where(steps_until > 0, steps_until, steps + 1).argmin())
         small, steps = sample.one(soonest), int(steps_until[soonest])
         draws = {name: values[soonest : soonest + 1] for name, values in draws.items()}
