@@ -50,7 +50,8 @@ class CompiledEnv(TensorEnv):
         self._results = ()
         kept = {"episode": self._episode, "returned": self._returned, "waiting": self._ended}
         self.episodes = self._stepper.bind(self.episodes, self.params, kept)
-        self._waiting = self._ended.numpy()
+        self._waiting, numbers = self._ended.numpy(), self._stepper.numbers
+        self._places = numbers[:, 0] if self.action_form.kind == "discrete" else numbers
         if self.observation.kind == "laws":
             self._laws = self.program.law_bytes(self.episodes).numpy()
         self._bound = self.episodes, self.params
@@ -100,12 +101,13 @@ class CompiledEnv(TensorEnv):
 
     def _new_results(self, stepper: Stepper) -> Results:
         """Return unreferenced results for the next call to write to."""
-        results = next(filter(Results.is_free, self._results), None)
-        if results is None:
+        for results in self._results:
+            if results.is_free():
+                break
+        else:
             space = self.observation.space
             keeps_last = self.autoreset_mode is AutoresetMode.SAME_STEP
-            make = np.zeros if self.observation.kind == "laws" else np.empty
-            shown = [make((self.num_envs, *space.shape), space.dtype) for _ in range(1 + keeps_last)]
+            shown = [np.zeros((self.num_envs, *space.shape), space.dtype) for _ in range(1 + keeps_last)]
             results = Results(np.empty(Results.SIZE * self.num_envs, np.uint8), *shown)
             del shown
             results.watch()
@@ -128,7 +130,7 @@ class CompiledEnv(TensorEnv):
             *parts, shown = super().step(actions)
             observed, reward, terminated, truncated = (part.cpu().numpy() for part in parts)
             return observed, reward, terminated, truncated, arrays_of(shown)
-        self._read(actions, stepper.numbers)
+        self._read(actions, self._places)
         mode = self.autoreset_mode
         if mode is AutoresetMode.DISABLED and np.count_nonzero(self._waiting):
             check_going(self._ended)
@@ -142,24 +144,23 @@ class CompiledEnv(TensorEnv):
         if status == EMPTY:
             stepper.fill(self._numbers)
             stepper.begin()
-        info, ended = dict(results.info), results.ended
+        info, ended = results.info.copy(), results.ended
         self._write_laws(results, ended)
         if mode is AutoresetMode.NEXT_STEP:
             info["_success"] = active
         if results.last_observed is not None:
-            info["final_info"] = dict(results.final_info)
-            info["final_obs"] = results.last_observed[: np.count_nonzero(ended)]
+            info["final_info"] = results.final_info.copy()
+            info["final_obs"] = results.last_observed[: stepper.play.ended]
             info["_final_obs"] = info["_final_info"] = ended
         if self.shows_mask:
             info["action_mask"] = self.action_masks().to(torch.int8).numpy()
             info["_action_mask"] = results.everyone
         return results.observed, results.reward, results.terminated, results.truncated, info
 
-    def _read(self, actions: Any, numbers: Any) -> None:
-        """Write actions into `numbers`, int64 [B, k]. Raises TypeError and ValueError as `TensorEnv.step`."""
+    def _read(self, actions: Any, places: Any) -> None:
+        """Write actions into `places`, int64 [B, k] or [B]. Raises TypeError and ValueError as `TensorEnv.step`."""
         given = actions.numpy() if isinstance(actions, Tensor) else actions
-        places = numbers[:, 0] if self.action_form.kind == "discrete" else numbers
-        if not isinstance(given, np.ndarray) or given.dtype.kind not in "iu" or given.shape != places.shape:
+        if not isinstance(given, np.ndarray) or given.shape != places.shape or given.dtype.kind not in "iu":
             checked = self.action_form.decode(actions)
             if len(checked) != self.num_envs:
                 raise ValueError(f"{len(checked)} actions for {self.num_envs} environments")

@@ -300,11 +300,11 @@ class Stepper(Plan):
         library, play, address = self.native.library, self._play, self._numbers_at
         self._state().forget()
         if not self.measures_cells:
-            status = int(library.pd_play(play, address))
-            if status == READY:
+            status: int = library.pd_play(play, address)
+            if status == READY and self._has_maps:
                 self._copy_maps()
             return status
-        status = int(library.pd_act(play, address))
+        status = library.pd_act(play, address)
         if status >= 0:
             return status
         if self.play.counted:

@@ -77,10 +77,7 @@ class ActionChannels:
 
 @dataclass(frozen=True)
 class LawChannels:
-    """From elements and laws, uint8 [B, 2, H, W] of `worlds.inputs_of`, to channels, float32 [B, channels, H, W].
-
-    These are one-hot elements, and what the cell's element does amid each other one, −1 to 1.
-    """
+    """From elements and laws, uint8 [B, 2, H, W], to one-hot elements and what each does amid the others, −1 to 1."""
 
     slots: int
     planes = (2,)

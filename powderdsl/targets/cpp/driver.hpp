@@ -205,11 +205,15 @@ static void run_group(Context& c, Batch& b, int number, long steps, const Clocks
   }
   for (int i = 0; i < PARAM_REALS; i++)
     for (int l = 0; l < LANES; l++) c.param_real[i][l] = reals[(size_t)i * b.worlds + c.worlds[l]];
-  for (int i = 0; i < 2; i++)
+  for (int i = 0; i < 2; i++) {
+    int last = -1;  // strips of a world have the same key
+    u32 key = 0;
     by_hash(c.world_keys[i], [&](int l) {
       const int world = c.worlds[l];
-      return world_key(k.seed[world], k.index[world], i ? 0x85A308D3u : 0x243F6A88u);
+      if (world != last) key = world_key(k.seed[world], k.index[world], i ? 0x85A308D3u : 0x243F6A88u), last = world;
+      return key;
     });
+  }
   Group& group = b.groups[number];
   for (int i = 0; i < SLOTS; i++) {
     c.slot[i] = group.slot[i];

@@ -99,7 +99,7 @@ struct Play {
   // Kept between the parts of a step.
   int64_t* action;  // [worlds][5]: taken, left, painted, placed, blown
   uint8_t* begins;  // whether the next episode begins
-  int64_t counted;
+  int64_t counted, ended;  // whether cells were counted; how many episodes ended in the last step
 };
 struct Results {  // one after another in memory
   int64_t *episode_length, *shown, *last_shown;
@@ -286,6 +286,7 @@ API int pd_finish(Play* play) {
   if (!p.counted) std::copy_n(p.before, values, p.now);
   std::vector<double> stack(std::max({p.each.count, p.final.count, p.success.count, p.failure.count}) + 1);
   bool ready = true;
+  p.ended = 0;
   for (int i = 0; i < worlds; i++) {
     auto value = [&](const Formula& formula) { return formula.count ? value_of(p, formula, i, stack.data()) : 0.0; };
     const bool waits = p.mode == NEXT_STEP && p.waiting[i], last = p.acted[i] >= p.actions;
@@ -297,6 +298,7 @@ API int pd_finish(Play* play) {
     bool truncated = (last || p.acted[i] >= p.limit) && !terminated;
     if (waits) reward = 0, success = terminated = truncated = false;
     const bool ended = terminated || truncated;
+    p.ended += ended;
     r.reward[i] = (float)reward;
     p.returned[i] += (double)r.reward[i];
     r.terminated[i] = terminated, r.truncated[i] = truncated, r.succeeded[i] = success, r.ended[i] = ended;

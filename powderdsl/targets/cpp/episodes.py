@@ -43,5 +43,5 @@ class Play(ctypes.Structure):
         *_whole("counts masks sizes measures mask_words own_masks"),
         *((name, Formula) for name in ("each", "final", "success", "failure")),
         *_whole("pool depth start_worlds base pool_world filled pool_start pool_sizes pool_masks"),
-        *_whole("views size view observed last_observed results action begins counted"),
+        *_whole("views size view observed last_observed results action begins counted ended"),
     )
