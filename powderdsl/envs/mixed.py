@@ -274,7 +274,7 @@ class MixedEnv(CompiledEnv):
         )
 
     def progress(self) -> tuple[float, int]:
-        """Return the return and length so far of the only episode."""
+        """The return and the length so far of the only episode."""
         ((env, _),) = self._groups.values()
         return env.progress()
 

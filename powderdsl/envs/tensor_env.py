@@ -299,7 +299,7 @@ class TensorEnv:
         return self._returned.clone()
 
     def progress(self) -> tuple[float, int]:
-        """Return the return and length so far of the only episode."""
+        """The return and the length so far of the only episode."""
         assert self.episodes is not None
         return self._returned.item(), int(self.episodes.acted.item())
 

@@ -66,7 +66,7 @@ class Recycled:
     _arrays: list[Any]
 
     def watch(self) -> None:
-        """Count the current references, those of this object. Not for `__init__`, whose caller holds its arguments."""
+        """Count the current references. The caller must not hold the arrays, as it does during `__init__`."""
         self._counts = [*map(getrefcount, self._arrays)]
 
     def is_free(self) -> bool:

@@ -41,7 +41,7 @@ class DataConfig(Checked):
     steps: int = setting(8, low=1)
     pairs: int = setting(16, low=1)
     rulesets: int = setting(0, "Use only the first N rulesets of the split; 0: all.", 0, 4096)
-    observation: str = setting("ids", "What networks see: elements, or also laws.", choices=("ids", "laws"))
+    observation: str = setting("ids", "Network inputs: elements, or also laws.", choices=("ids", "laws"))
     capacity: int = setting(1024 * 256, "Capacity of the buffer, in pairs.", 1, 1 << 32, option="buffer")
     refresh: int = setting(256, "Pairs of the buffer that each iteration replaces.", 1, 1 << 20)
 

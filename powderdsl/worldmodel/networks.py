@@ -77,7 +77,7 @@ class ActionChannels:
 
 @dataclass(frozen=True)
 class LawChannels:
-    """From elements and laws, uint8 [B, 2, H, W], to one-hot elements and what each does amid the others, −1 to 1."""
+    """From elements and laws, uint8 [B, 2, H, W], to channels: one-hot elements and their laws, −1 to 1."""
 
     slots: int
     planes = (2,)

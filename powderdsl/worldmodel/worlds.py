@@ -73,7 +73,7 @@ class Batch:
 
     parts: tuple[tuple[Tensor, Episodes], ...]
     laws: Tensor | None = None
-    """If networks see them, bytes of each world's laws, uint8 [B, H, W]: see `law_plane`."""
+    """Bytes of each world's laws, uint8 [B, H, W], if the network observes them: see `law_plane`."""
 
     @property
     def ids(self) -> Tensor:
@@ -87,7 +87,7 @@ class Batch:
 def law_plane(program: TaskProgram, episodes: Episodes, slots: int) -> Tensor:
     """The laws of a ruleset as bytes of cells, uint8 [H, W].
 
-    Bytes 4·(slots·a + b) to … + 3 are what a square of element a did amid element b (`tasks.laws.experiments`).
+    Four bytes from 4·(slots·a + b) on are the outcomes of a square of element a inside element b (`tasks.laws.experiments`).
     """
     pairs = tried_pairs(program.task.ruleset)
     numbers = program.law_bytes(episodes)[0, : len(NUMBERS) * len(pairs)].view(len(pairs), len(NUMBERS))
@@ -97,7 +97,7 @@ def law_plane(program: TaskProgram, episodes: Episodes, slots: int) -> Tensor:
 
 
 def inputs_of(world: Any) -> Tensor:
-    """The part of worlds that networks see: ids, uint8 [B, H, W]; or ids and bytes of laws, uint8 [B, 2, H, W]."""
+    """Network inputs for worlds: ids, uint8 [B, H, W]; or ids and bytes of laws, uint8 [B, 2, H, W]."""
     laws = getattr(world, "laws", None)
     return world.ids if laws is None else torch.stack([world.ids, laws], 1)
 

@@ -245,7 +245,7 @@ def test_results_that_are_held_stay(mode):
     assert len(memory) < 30
 
 
-def test_results_that_nobody_holds_are_used_again():
+def test_results_without_references_are_reused():
     _, env = both(load_task("sand-pushing"), 2)
     env.reset(seed=1)
     for _ in range(3):
@@ -256,7 +256,7 @@ def test_results_that_nobody_holds_are_used_again():
     assert env._results is results
 
 
-def test_an_array_is_free_while_nobody_holds_it_or_a_view_of_it():
+def test_an_array_is_free_without_references_to_it_or_a_view():
     from powderdsl.tasks.compiled import Rows
 
     memory = Rows((3,), np.uint8)

@@ -138,7 +138,7 @@ class WasmLibrary:
 
 
 def test_webassembly_does_the_same_as_python(sand_pushing):
-    """With the command of the docs; with Debian's clang++ where there is no ziglang."""
+    """Compiled by the command of the docs, or by Debian's clang++ if ziglang is not installed."""
     (words,) = re.findall(r"^(python -m ziglang.*?env\.wasm)$", DOCS.read_text("utf-8"), re.S | re.M)
     command = [sys.executable, *words.replace("\\\n", " ").split()[1:]]
     if importlib.util.find_spec("ziglang") is None:
