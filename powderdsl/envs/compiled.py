@@ -131,12 +131,9 @@ class CompiledEnv(TensorEnv):
             observed, reward, terminated, truncated = (part.cpu().numpy() for part in parts)
             return observed, reward, terminated, truncated, arrays_of(shown)
         self._read(actions, self._places)
-        mode = self.autoreset_mode
-        if mode is AutoresetMode.DISABLED and np.count_nonzero(self._waiting):
+        if self.autoreset_mode is AutoresetMode.DISABLED and np.count_nonzero(self._waiting):
             check_going(self._ended)
         results = self._new_results(stepper)
-        results.everyone.fill(True)
-        active = ~self._waiting if mode is AutoresetMode.NEXT_STEP else results.everyone
         status = stepper.step()
         if status >= 0:
             self.action_form.decode(actions)  # raises ValueError
@@ -146,8 +143,6 @@ class CompiledEnv(TensorEnv):
             stepper.begin()
         info, ended = results.info.copy(), results.ended
         self._write_laws(results, ended)
-        if mode is AutoresetMode.NEXT_STEP:
-            info["_success"] = active
         if results.last_observed is not None:
             info["final_info"] = results.final_info.copy()
             info["final_obs"] = results.last_observed[: stepper.play.ended]

@@ -412,15 +412,16 @@ class Episodes:
         Raises ResetNeeded before the first episode.
         """
         assert self._world
-        frames, shown = self.program.frames(self.stage, *self._chosen[:, :2].T), self._pictures
+        shown = self._pictures.flatten(2)
+        frames = torch.from_numpy(self.program.frames(self.stage, *self._chosen[:, :2].T))
         if shown.device.type != "cpu":
-            return (shown.flatten(2) | torch.from_numpy(frames).to(shown.device)).view_as(shown)
+            return (shown | frames.to(shown.device)).view_as(self._pictures)
         memory = next(filter(Rows.is_free, self._memory), None)
         if memory is None:
-            memory = Rows((self.count, len(shown[0]), frames.shape[2]), np.uint8)
+            memory = Rows(tuple(shown.shape), np.uint8)
             self._memory = [*self._memory[-3:], memory]
-        np.bitwise_or(shown.flatten(2).numpy(), frames, out=memory.rows)
-        return torch.from_numpy(memory.rows).view_as(shown)
+        rows = torch.from_numpy(memory.rows)
+        return torch.bitwise_or(shown, frames, out=rows).view_as(self._pictures)
 
     def goals(self) -> Tensor:
         """The goals as observations: uint8 [B, H, W, 6]."""

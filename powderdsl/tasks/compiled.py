@@ -97,12 +97,11 @@ class Results(Recycled):
 
     def __init__(self, memory: Any, observed: Any, last_observed: Any = None):
         worlds = len(observed)
-        kinds = (*[np.int64] * 3, *[np.float32] * 2, *[np.bool_] * 4)
+        kinds = (*[np.int64] * 3, *[np.float32] * 2, *[np.bool_] * 6)
         ends = np.cumsum([0] + [worlds * np.dtype(kind).itemsize for kind in kinds])
         rows: list[Any] = [memory[a:b].view(kind) for (a, b), kind in zip(pairwise(ends), kinds, strict=True)]
         self.episode_length, self.world, self.last_world, self.reward, self.episode_return = rows[:5]
-        self.terminated, self.truncated, self.success, self.ended = rows[5:]
-        self.everyone = np.ones(worlds, np.bool_)
+        self.terminated, self.truncated, self.success, self.ended, self.active, self.everyone = rows[5:]
         self.observed, self.last_observed = observed, last_observed
         names = ("success", "episode_return", "episode_length")
         self.final_info: dict[str, Any] = {
@@ -114,10 +113,11 @@ class Results(Recycled):
         self.info: dict[str, Any] = {
             **{name: getattr(self, name) for name in (*names, "world")},
             **dict.fromkeys(("_episode_return", "_episode_length"), self.ended),
-            **dict.fromkeys(("_success", "_world"), self.everyone),
+            "_success": self.active,
+            "_world": self.everyone,
         }
         """Infos of all episodes."""
-        self._arrays = [memory, *rows, self.everyone, observed]
+        self._arrays = [memory, *rows, observed]
         if last_observed is not None:
             self._arrays.append(last_observed)
         self.addresses = {"results": memory.ctypes.data, "observed": self.observed.ctypes.data}

@@ -45,7 +45,7 @@ API powder_env* powder_new(int worlds) {
   rows(env->seed, p.seed, 1), rows(env->index, p.index, 1), rows(env->step, p.step, 1);
   rows(env->world, p.world, 1), rows(env->acted, p.acted, 1), rows(env->episode, p.episode, 1), rows(env->base, p.base, 1);
   rows(env->action, p.action, ACTION_NUMBERS), rows(env->failed, p.failed, 1), rows(env->waiting, p.waiting, 1);
-  rows(env->begins, p.begins, 1), rows(env->results, p.results, 36), rows(env->returned, p.returned, 1);
+  rows(env->begins, p.begins, 1), rows(env->results, p.results, 38), rows(env->returned, p.returned, 1);
   rows(env->start, p.start, p.measures), rows(env->before, p.before, p.measures), rows(env->now, p.now, p.measures);
   env->masks.assign(p.pool_masks, p.pool_masks + p.mask_words), env->sizes.assign(p.pool_sizes, p.pool_sizes + p.measures);
   if (p.own_masks) rows(env->masks, p.masks, p.mask_words), rows(env->sizes, p.sizes, p.measures);

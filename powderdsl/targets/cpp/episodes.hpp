@@ -104,11 +104,12 @@ struct Play {
 struct Results {  // one after another in memory
   int64_t *episode_length, *shown, *last_shown;
   float *reward, *episode_return;
-  uint8_t *terminated, *truncated, *succeeded, *ended;
+  uint8_t *terminated, *truncated, *succeeded, *ended, *active, *everyone;
   Results(uint8_t* at, size_t n) {
     episode_length = (int64_t*)at, shown = episode_length + n, last_shown = shown + n;
     reward = (float*)(last_shown + n), episode_return = reward + n;
     terminated = (uint8_t*)(episode_return + n), truncated = terminated + n, succeeded = truncated + n, ended = succeeded + n;
+    active = ended + n, everyone = active + n;
   }
 };
 enum { TAKEN, LEFT, PAINTED, PLACED, BLOWN, ACTION_NUMBERS };
@@ -302,6 +303,7 @@ API int pd_finish(Play* play) {
     r.reward[i] = (float)reward;
     p.returned[i] += (double)r.reward[i];
     r.terminated[i] = terminated, r.truncated[i] = truncated, r.succeeded[i] = success, r.ended[i] = ended;
+    r.active[i] = !waits, r.everyone[i] = true;  // again: callers may have changed the last ones
     r.episode_return[i] = (float)(p.returned[i] * ended);
     r.episode_length[i] = p.acted[i] * ended;
     r.last_shown[i] = p.world[i];
