@@ -19,6 +19,7 @@ from torch import Tensor
 from powderdsl.compiler import load, lower
 from powderdsl.diagnostics import with_suggestion
 from powderdsl.model.types import Ruleset
+from powderdsl.ogbench.compiled import INVALID, CompiledSteps
 from powderdsl.ogbench.levels import GoalTask, Level, read_task
 from powderdsl.simulation.draw import palette
 from powderdsl.simulation.programs import BackendProgram
@@ -84,45 +85,42 @@ class LevelProgram:
         """The colors of the elements that agents paint: uint8 [n, 3]."""
         line, begins = np.arange(level.side), first.cpu().numpy()[:, None]
         inside = (line >= begins) & (line < begins + level.brush)
-        # Lines of frames, uint8 [n + 1, 6 W], behind one for what is not chosen yet: 255 where an x is lit; colors.
-        self._lit = np.repeat(np.vstack([line >= 0, inside]) * np.uint8(255), 6, 1)
-        self._colors = np.tile(np.pad(self.paints.cpu().numpy(), ((1, 0), (3, 0))), level.side)
+        # Rows of frames, uint8 [n + 1, 6 W], after one for what is not chosen yet: 255 where an x is lit; colors.
+        self.lit = np.repeat(np.vstack([line >= 0, inside]) * np.uint8(255), 6, 1)
+        self.colors = np.tile(np.pad(self.paints.cpu().numpy(), ((1, 0), (3, 0))), level.side)
 
     def start(self, seeds: Numbers, indices: Numbers) -> World:
         """New worlds. Their draws depend on seed and index, int64 [B] of at least 0 each."""
         ids = self._start.repeat(len(seeds), 1, 1)
         return self.simulator.world(ids, torch.from_numpy(seeds), index=torch.from_numpy(indices))
 
-    def act(
-        self, world: World, painted: Numbers, planes: NDArray[np.float64] | None = None, *, reuse: bool = True
-    ) -> World:
+    def act(self, world: World, painted: Numbers, planes: NDArray[np.float64] | None = None) -> World:
         """Run one step of the rules, then paint a block in each world, except on the frame.
+
+        The memory of `world`, which must not be used afterwards, is overwritten.
 
         Args:
             painted: int64 [B, 3]: the index of the element, x and y.
             planes: [streams, B, H, W] in [0, 1): draws to use instead of random numbers, in the order of the rules'
                 streams.
-            reuse: overwrite the memory of `world`, which must not be used afterwards.
         """
         draws: Mapping[str, Any] | None = None
         if planes is not None:
             draws = dict(zip(self.streams, planes, strict=True))
-        stepped = self.simulator.step(world, random=draws, reuse=reuse)
+        stepped = self.simulator.step(world, random=draws, reuse=True)
         element, x, y = painted.T
         where: Any = self._covers[x] & self._covers[y]
         ids: Any = self.ids[element]
-        packed = isinstance(stepped.state, PackedState)
-        if not packed:
+        if not isinstance(stepped.state, PackedState):
             ids, x, y, where = (torch.from_numpy(part).to(self.device) for part in (ids, x, y, where))
         values = self.blocks.fresh_cells(stepped.state, ids)
-        reuse = reuse or packed  # a step creates its own packed state
         cells = self.blocks.cells(stepped.state, y, x)
-        return stepped.with_state(self.blocks.filled(stepped.state, cells, where, values, reuse=reuse))
+        return stepped.with_state(self.blocks.filled(stepped.state, cells, where, values, reuse=True))
 
     def frames(self, stage: Numbers, element: Numbers, x: Numbers) -> NDArray[np.uint8]:
         """A line of each action frame, as observations have it: uint8 [B, 1, 6 W]. All are int64 [B]."""
-        colors = self._colors.take((1 + element) * (stage > 0), 0)
-        return (colors & self._lit.take((1 + x) * (stage > 1), 0))[:, None]
+        colors = self.colors.take((1 + element) * (stage > 0), 0)
+        return (colors & self.lit.take((1 + x) * (stage > 1), 0))[:, None]
 
     def errors(self, ids: Tensor, goals: Tensor) -> Numbers:
         """Number of cells of goals, uint8 [B, H, W], without their element there or next to it in `ids`: int64 [B]."""
@@ -263,15 +261,17 @@ class Episodes:
         self.tolerance = np.zeros(batch, dtype=np.int64)
         self.task_number = np.zeros(batch, dtype=np.int64)
         """The task of each episode, from 1; 0 for a custom task."""
-        self._chosen = np.zeros((batch, 3), dtype=np.int64)
+        self.chosen = np.zeros((batch, 3), dtype=np.int64)
+        """The last element, x and y that were chosen."""
         self.world: World | None = None
-        self._pictures = torch.zeros(batch, side, side, 6, dtype=torch.uint8, device=device)
+        self.pictures = torch.zeros(batch, side, side, 6, dtype=torch.uint8, device=device)
         """The worlds' pictures, without action frames."""
         self._memory: list[Rows] = []
         """Of observations."""
         self.goal_ids = torch.zeros(batch, side, side, dtype=torch.uint8, device=device)
         self.goal_pictures = torch.zeros(batch, side, side, 3, dtype=torch.uint8, device=device)
         self._goals: dict[tuple[int, GoalTask], Goal] = {}
+        self._compiled: CompiledSteps | None = None
 
     # Beginning
 
@@ -356,7 +356,11 @@ class Episodes:
         Actions, int64 [B], that are not valid at their stage are replaced by random valid ones. Returns success, bool
         [B]: whether the worlds match their goals now.
         """
-        part, which = self._world, np.arange(self.count) if active is None else np.flatnonzero(active)
+        part, steps = self._world, self._ready()
+        if steps is not None:
+            steps.choose(actions, np.ones(self.count, np.bool_) if active is None else active)
+            return self.success
+        which = np.arange(self.count) if active is None else np.flatnonzero(active)
         stages = self.stage[which]
         choices = np.where(stages == 0, self.level.choices(0), self.level.choices(1))
         parts = actions[which]
@@ -365,8 +369,8 @@ class Episodes:
             for stage in range(3):
                 bad = np.flatnonzero(invalid & (stages == stage))
                 if len(bad):
-                    parts[bad] = self._drawn(which[bad], "ogbench invalid", self.level.choices(stage))
-        self._chosen[which, stages] = parts
+                    parts[bad] = self._drawn(which[bad], INVALID, self.level.choices(stage))
+        self.chosen[which, stages] = parts
         self.stage[which] = (stages + 1) % 3
         self.elapsed[which] += 1
         painting = which[stages == 2]
@@ -374,8 +378,17 @@ class Episodes:
             if len(painting) < self.count:
                 part = take_worlds(part, torch.from_numpy(painting).to(self.program.device))
             planes = self._draws.planes(painting)
-            self._put(painting, self.program.act(part, self._chosen[painting], planes))
+            self._put(painting, self.program.act(part, self.chosen[painting], planes))
         return self.success
+
+    def _ready(self) -> CompiledSteps | None:
+        """Return the steps in native code; None if the worlds do not run as native code."""
+        native = self.program.simulator.native(self.level.side)
+        if native is None or type(self._draws) is not Draws:
+            return None
+        if self._compiled is None or self._compiled.native is not native:
+            self._compiled = CompiledSteps(self, native)
+        return self._compiled
 
     @property
     def success(self) -> NDArray[np.bool_]:
@@ -392,17 +405,15 @@ class Episodes:
         """Update the pictures and errors of the worlds `which`."""
         if len(which) == self.count:
             self.world, goals = part, self.goal_ids
-            part.sim.observer.rgb(part.state, self._pictures, size=6)
+            part.sim.observer.rgb(part.state, self.pictures, size=6)
         else:
             places = torch.from_numpy(which).to(self.program.device)
-            shown = torch.empty_like(self._pictures[: len(which)])
-            put_rows(self._pictures, places, part.sim.observer.rgb(part.state, shown, size=6), reuse=True)
+            shown = torch.empty_like(self.pictures[: len(which)])
+            put_rows(self.pictures, places, part.sim.observer.rgb(part.state, shown, size=6), reuse=True)
             self.world = put_worlds(self._world, places, part, reuse=True)
             goals = self.goal_ids[places]
         if self.mode == "task":
-            state = part.state
-            missed = state.missed(goals) if isinstance(state, PackedState) else None
-            self.errors[which] = self.program.errors(part.ids, goals) if missed is None else missed
+            self.errors[which] = self.program.errors(part.ids, goals)
 
     # Showing
 
@@ -412,16 +423,17 @@ class Episodes:
         Raises ResetNeeded before the first episode.
         """
         assert self._world
-        shown = self._pictures.flatten(2)
-        frames = torch.from_numpy(self.program.frames(self.stage, *self._chosen[:, :2].T))
-        if shown.device.type != "cpu":
-            return (shown | frames.to(shown.device)).view_as(self._pictures)
+        steps = self._ready()
+        if steps is None:
+            frames = torch.from_numpy(self.program.frames(self.stage, *self.chosen[:, :2].T))
+            shown = self.pictures.flatten(2) | frames.to(self.pictures.device)
+            return shown.view_as(self.pictures)
         memory = next(filter(Rows.is_free, self._memory), None)
         if memory is None:
-            memory = Rows(tuple(shown.shape), np.uint8)
+            memory = Rows(tuple(self.pictures.shape), np.uint8)
             self._memory = [*self._memory[-3:], memory]
-        rows = torch.from_numpy(memory.rows)
-        return torch.bitwise_or(shown, frames, out=rows).view_as(self._pictures)
+        steps.observe(memory.address)
+        return torch.from_numpy(memory.rows)
 
     def goals(self) -> Tensor:
         """The goals as observations: uint8 [B, H, W, 6]."""

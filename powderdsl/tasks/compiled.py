@@ -23,6 +23,7 @@ from powderdsl.targets.cpp.program import NativeProgram, PackedState, Places, Vi
 from powderdsl.targets.layout import parameters
 from powderdsl.tasks.episodes import Episodes, TaskProgram, params_of
 from powderdsl.tasks.goals import ACTION_WORDS
+from powderdsl.tasks.tensors.actions import Blocks
 from powderdsl.tasks.tensors.measures import Masks
 
 POOL_CELLS = 1 << 22
@@ -79,6 +80,7 @@ class Rows(Recycled):
 
     def __init__(self, shape: tuple[int, ...], dtype: Any):
         self.rows = np.empty(shape, dtype)
+        self.address = self.rows.ctypes.data
         self._arrays = [self.rows]
         self.watch()
 
@@ -124,7 +126,42 @@ class Results(Recycled):
         self.addresses["last_observed"] = 0 if self.last_observed is None else self.last_observed.ctypes.data
 
 
-class Plan:
+class Arguments:
+    """Arrays whose addresses are in a structure, for worlds with a state's layout."""
+
+    def __init__(self, places: Places):
+        self.places = places
+        self.arrays: dict[str, Any] = {}
+        """By the names of the structure's members."""
+
+    def address(self, name: str, values: Any) -> int:
+        """Return the address of an array, which is kept alive under a name."""
+        if isinstance(values, ctypes.Array):
+            self.arrays[name] = values
+            return ctypes.addressof(values)
+        self.arrays[name] = array = np.ascontiguousarray(values)
+        return int(array.ctypes.data)
+
+    def set_fresh(self, structure: Any, blocks: Blocks, ids: Any) -> None:
+        """Describe new cells of the elements `ids`, int64 [n], which actions choose by their index."""
+        fresh = []
+        for name, table in blocks.fresh.items():
+            values = table.cpu()[ids]
+            for piece in self.places.pieces[name]:
+                part = values if piece.component is None else values[:, piece.component]
+                slot, bits, _ = self.places.homes[piece.slot]
+                numbers = part.long() if bits else part.float()
+                fresh.append(Fresh(slot, bits, self.address(f"fresh {piece.slot}", numbers)))
+        structure.fresh_count, structure.fresh = (
+            len(fresh),
+            self.address("fresh", (Fresh * len(fresh))(*fresh)),
+        )
+        structure.element, structure.element_bits, _ = self.places.homes["element"]
+        for name, edges in zip(("row_edges", "column_edges"), blocks.edges, strict=True):
+            setattr(structure, name, self.address(name, edges.cpu()))
+
+
+class Plan(Arguments):
     """The part of a step that does not depend on the worlds: `play` without their arrays.
 
     Args:
@@ -152,9 +189,8 @@ class Plan:
         columns: Tensor | None,
         table: Tensor,
     ):
-        self.program, self.places, self.views = program, places, views
-        self.arrays: dict[str, Any] = {}
-        """Arrays whose addresses are in `play`, by the names of its members."""
+        super().__init__(places)
+        self.program, self.views = program, views
         agent, goal, hands = program.task.agent, program.task.goal, program.hands
         self.counts = program.meter.counts(places)
         counted = 0 if self.counts is None else len(self.counts.numbers)
@@ -178,42 +214,18 @@ class Plan:
             counts=0 if self.counts is None else ctypes.addressof(self.counts.plan),
             counts_painted=hands.counts,
         )
-        play.most = self._address("most", np.array(most, np.int64))
+        play.most = self.address("most", np.array(most, np.int64))
         if columns is None:
-            play.table = self._address("table", table)
+            play.table = self.address("table", table)
         else:
-            play.column = self._address("column", columns)
-        for name, edges in zip(("row_edges", "column_edges"), hands.blocks.edges, strict=True):
-            setattr(play, name, self._address(name, edges))
-        play.choices = self._address("choices", np.array(agent.choices, np.int64))
-        play.element, play.element_bits, _ = places.homes["element"]
-        fresh = list(self._fresh_values())
-        play.fresh_count, play.fresh = len(fresh), self._address("fresh", (Fresh * len(fresh))(*fresh))
+            play.column = self.address("column", columns)
+        play.choices = self.address("choices", np.array(agent.choices, np.int64))
+        self.set_fresh(play, hands.blocks, np.array(agent.choices).clip(0))
         speeds = [] if agent.speed_field is None else places.pieces[agent.speed_field]
         play.speed_row, play.speed_column = [places.homes[piece.slot][0] for piece in speeds] or (-1, -1)
         for name in ("each", "final", "success", "failure"):
             steps = operations(getattr(goal, name), program.measure_numbers)
-            getattr(play, name).count, getattr(play, name).ops = len(steps), self._address(name, steps)
-
-    def _address(self, name: str, values: Any) -> int:
-        """Return the address of an array, which is kept alive under a name."""
-        if isinstance(values, ctypes.Array):
-            self.arrays[name] = values
-            return ctypes.addressof(values)
-        self.arrays[name] = array = np.ascontiguousarray(values)
-        return array.ctypes.data
-
-    def _fresh_values(self) -> Iterator[Fresh]:
-        """Yield the values that placed elements set in each slot that travels with them."""
-        choices = np.array(self.program.task.agent.choices).clip(0)
-        for name, table in self.program.hands.blocks.fresh.items():
-            values = table.cpu()[choices]
-            for piece in self.places.pieces[name]:
-                part = values if piece.component is None else values[:, piece.component]
-                slot, bits, _ = self.places.homes[piece.slot]
-                yield Fresh(
-                    slot, bits, self._address(f"fresh {piece.slot}", part.long() if bits else part.float())
-                )
+            getattr(play, name).count, getattr(play, name).ops = len(steps), self.address(name, steps)
 
 
 class Stepper(Plan):

@@ -106,13 +106,14 @@ def test_a_batch_plays_the_worlds_of_single_environments(hard: LevelProgram) -> 
     assert begun == 2
 
 
-@pytest.mark.parametrize("backend", ["torch", "native"])
-def test_backends_play_the_same_episodes(easy: LevelProgram, backend: str) -> None:
+@pytest.mark.parametrize(("level", "backend"), [("easy", "torch"), ("easy", "native"), ("hard", "native")])
+def test_backends_play_the_same_episodes(request: Any, level: str, backend: str) -> None:
     """Also once stages differ."""
     skip_without_compiler(backend)
+    on_wasm = request.getfixturevalue(level)
     rows = actions(60, 3)
     seen = []
-    for program in (easy, LevelProgram(easy.level, backend=backend)):
+    for program in (on_wasm, LevelProgram(on_wasm.level, backend=backend)):
         env = PowderworldVectorEnv(program, 3, seed=1)
         env.reset(options={"task_id": 3})
         frames = [env.step(row)[0] for row in rows[:20]]
@@ -124,7 +125,8 @@ def test_backends_play_the_same_episodes(easy: LevelProgram, backend: str) -> No
 
 
 def test_observations_that_somebody_holds_stay(easy: LevelProgram, torch: Any) -> None:
-    env = PowderworldVectorEnv(easy, 2)
+    skip_without_compiler("native")
+    env = PowderworldVectorEnv(LevelProgram(easy.level, backend="native"), 2)
     env.reset()
     held, copies, addresses = [], [], set()
     for number, row in enumerate(actions(12, 2)):

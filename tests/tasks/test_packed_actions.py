@@ -136,7 +136,7 @@ def test_spent_worlds_are_refused(torch):
 
 
 @pytest.mark.parametrize("size", ["[32, 32]", "[64, 64]", "[24, 70]", "[9, 19]"])
-def test_packed_worlds_are_taken_put_and_compared_without_unpacking(torch, size):
+def test_packed_worlds_are_taken_and_put_without_unpacking(torch, size):
     task = read_task(Source("packed.yaml", TASK.replace("SIZE", size)), Reporter())
     program = compile_task(task, backend="native")
     for batch in (3, 40):
@@ -150,8 +150,3 @@ def test_packed_worlds_are_taken_put_and_compared_without_unpacking(torch, size)
         for name, value in cells.items():
             value[[0, 2]] = value[[2, 0]]
             assert torch.equal(after.state[name], value), name
-        ids, goals = after.ids, after.ids.roll(1, 0)
-        matched = ids == goals
-        for axis, by in ((1, 1), (1, -1), (2, 1), (2, -1)):
-            matched |= ids.roll(by, axis) == goals
-        assert after.state.missed(goals).tolist() == (~matched).sum((1, 2)).tolist()

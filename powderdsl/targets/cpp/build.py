@@ -298,12 +298,13 @@ SIGNATURES = {
     "pd_put": "- piiipip",
     "pd_fill": "- piipp",
     "pd_show": "- pippl",
-    "pd_missed": "- piipp",
     "pd_take": "- ppppi",
     "pd_act": "l pp",
     "pd_finish": "i p",
     "pd_begin": "- p",
     "pd_play": "l pp",
+    "pd_choose": "- ppp",
+    "pd_observe": "- ppi",
 }
 """The result and the arguments of each function of a library, by letters of `_TYPES`."""
 

@@ -128,10 +128,23 @@ static void count_painted(const Play& p, Batch& b, const int64_t* boxes, const i
     }
   });
 }
+// Fills boxes with new cells of the elements `chosen`. `before(fresh, values)` sees the whole numbers of each slot first.
+template <class P, class Before> static void place(const P& p, Batch& b, const int64_t* boxes, const int64_t* chosen, Before before) {
+  std::vector<int64_t> values(b.worlds);
+  std::vector<float> reals(b.worlds);
+  for (int k = 0; k < p.fresh_count; k++) {
+    const Fresh& fresh = p.fresh[k];
+    for (int i = 0; i < b.worlds; i++)
+      if (fresh.bits) values[i] = ((const int64_t*)fresh.values)[chosen[i]];
+      else reals[i] = ((const float*)fresh.values)[chosen[i]];
+    if (fresh.bits) before(fresh, values.data()), fill_values(b, fresh.slot, fresh.bits, boxes, values.data());
+    else fill_reals(b, fresh.slot, boxes, reals.data());
+  }
+}
 static void act(Play& p, Batch& b, const int64_t* actions) {
   const int worlds = b.worlds;
-  std::vector<int64_t> placed(4 * worlds), blown(4 * worlds), chosen(worlds), values(worlds);
-  std::vector<float> speeds[2] = {std::vector<float>(worlds), std::vector<float>(worlds)}, reals(worlds);
+  std::vector<int64_t> placed(4 * worlds), blown(4 * worlds), chosen(worlds);
+  std::vector<float> speeds[2] = {std::vector<float>(worlds), std::vector<float>(worlds)};
   bool places = false, blows = false;
   for (int i = 0; i < worlds; i++) {
     int64_t five[5] = {0, 0, 0, 1, 1};
@@ -149,25 +162,19 @@ static void act(Play& p, Batch& b, const int64_t* actions) {
     for (int axis = 0; axis < 2; axis++)
       for (int end = 0; end < 2; end++) box[2 * axis + end] = p.edges[axis][2 * five[1 - axis] + end];
   }
-  for (int k = 0; places && k < p.fresh_count; k++) {
-    const Fresh& fresh = p.fresh[k];
-    for (int i = 0; i < worlds; i++)
-      if (fresh.bits) values[i] = ((const int64_t*)fresh.values)[chosen[i]];
-      else reals[i] = ((const float*)fresh.values)[chosen[i]];
-    if (fresh.slot == p.element && fresh.bits && p.counts_painted)
-      count_painted(p, b, placed.data(), values.data(), p.action + PAINTED);
-    if (fresh.bits) fill_values(b, fresh.slot, fresh.bits, placed.data(), values.data());
-    else fill_reals(b, fresh.slot, placed.data(), reals.data());
-  }
+  if (places)
+    place(p, b, placed.data(), chosen.data(), [&](const Fresh& fresh, const int64_t* values) {
+      if (fresh.slot == p.element && p.counts_painted) count_painted(p, b, placed.data(), values, p.action + PAINTED);
+    });
   for (int axis = 0; blows && axis < 2; axis++)
     if (p.speed_slots[axis] >= 0) fill_reals(b, p.speed_slots[axis], blown.data(), speeds[axis].data());
 }
-// The free steps of the worlds that have had their last action.
-static void run_free(Play& p, Batch& b, const std::vector<int>& places) {
+// Steps of some worlds, in ascending order, with the clocks and parameters of `p`.
+template <class P> static void run_some(P& p, Batch& b, const std::vector<int>& places, int64_t steps) {
   const size_t count = places.size(), worlds = b.worlds;
   if (count == worlds) {
-    pd_run(&b, 0, p.free_steps, p.threads, p.seed, p.index, p.step, 0, p.param_planes, p.param_reals, nullptr);
-    for (size_t i = 0; i < worlds; i++) p.step[i] += p.free_steps;
+    pd_run(&b, 0, steps, p.threads, p.seed, p.index, p.step, 0, p.param_planes, p.param_reals, nullptr);
+    for (size_t i = 0; i < worlds; i++) p.step[i] += steps;
     return;
   }
   Batch* part = (Batch*)pd_new(count, b.g.world_height(), b.g.width);
@@ -181,8 +188,8 @@ static void run_free(Play& p, Batch& b, const std::vector<int>& places) {
     for (size_t n = 0; n < PARAM_PLANES; n++) planes[n * count + k] = p.param_planes[n * worlds + i];
     for (size_t n = 0; n < PARAM_REALS; n++) reals[n * count + k] = p.param_reals[n * worlds + i];
   }
-  pd_run(part, 0, p.free_steps, p.threads, seed.data(), index.data(), step.data(), 0, planes.data(), reals.data(), nullptr);
-  for (size_t k = 0; k < count; k++) copy_world(b, places[k], *part, k), p.step[places[k]] += p.free_steps;
+  pd_run(part, 0, steps, p.threads, seed.data(), index.data(), step.data(), 0, planes.data(), reals.data(), nullptr);
+  for (size_t k = 0; k < count; k++) copy_world(b, places[k], *part, k), p.step[places[k]] += steps;
   pd_free(part);
 }
 // The first part of a step. Returns -1; or the place of the first number that is out of range, and nothing has changed.
@@ -201,7 +208,7 @@ API int64_t pd_act(Play* play, const int64_t* actions) {
     any_last |= p.acted[i] >= p.actions;
     if (p.acted[i] >= p.actions && !(p.waiting[i] && p.mode == NEXT_STEP)) last.push_back(i);
   }
-  if (p.free_steps && !last.empty()) run_free(p, b, last);
+  if (p.free_steps && !last.empty()) run_some(p, b, last, p.free_steps);
   p.counted = p.counts_always || any_last;
   if (p.counted && p.counts) count_cells(b, *p.counts, p.masks, p.own_masks ? p.mask_words : 0, p.sizes, p.own_masks ? p.measures : 0, p.now);
   return -1;

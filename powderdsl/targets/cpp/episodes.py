@@ -1,4 +1,4 @@
-"""The data layout for stepping the episodes of a task in one call: `Play` of episodes.hpp."""
+"""The data layouts for stepping episodes in one call: `Play` of episodes.hpp, and `Level` of levels.hpp."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def _whole(names: str) -> tuple[tuple[str, Any], ...]:
 
 
 class Play(ctypes.Structure):
-    """Everything that a step reads and writes. Addresses point to arrays that the caller keeps."""
+    """Everything that a step of a task reads and writes. Addresses point to arrays that the caller keeps."""
 
     _fields_ = (
         *_whole("threads steps free_steps actions limit mode last_terminates counts_always"),
@@ -44,4 +44,13 @@ class Play(ctypes.Structure):
         *((name, Formula) for name in ("each", "final", "success", "failure")),
         *_whole("pool depth start_worlds base pool_world filled pool_start pool_sizes pool_masks"),
         *_whole("views size view observed last_observed results action begins counted ended"),
+    )
+
+
+class Level(ctypes.Structure):
+    """Everything that a step of an OGBench level reads and writes. Addresses point to arrays that the caller keeps."""
+
+    _fields_ = _whole(
+        "threads elements places row_edges column_edges fresh_count element element_bits fresh views size line view"
+        " colors lit name batch seed index step param_planes param_reals stage elapsed chosen errors goals pictures"
     )

@@ -179,12 +179,6 @@ class PackedState(OwnedBatch):
         library.pd_take(taken.handle, None, self.handle, places.data_ptr(), rows)
         return taken
 
-    def missed(self, goals: Tensor) -> Tensor:
-        """Count the cells of contiguous goals, uint8 [B, H, W], whose element is neither there nor beside it: int64 [B]."""
-        counts, (slot, bits, _) = torch.empty(len(goals), dtype=torch.int64), self.program.homes["element"]
-        self.program.library.pd_missed(self.handle, slot, bits, goals.data_ptr(), counts.data_ptr())
-        return counts
-
     def put(self, places: Tensor, state: Mapping[str, Tensor], *, reuse: bool) -> PackedState:
         """The state with the worlds `places`, int64 [n], replaced by those of another state of n worlds.
 

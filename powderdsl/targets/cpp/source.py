@@ -18,7 +18,7 @@ GENERATOR_VERSION = 13
 
 LIBRARY = ("vectors", "runtime", "planes", "movements", "fields")
 """Headers before the generated passes, in this order."""
-DRIVER = ("driver", "views", "episodes")
+DRIVER = ("driver", "views", "episodes", "levels")
 """Headers after the generated passes."""
 
 UNIT_SIZE = 40_000

@@ -105,13 +105,27 @@ API void pd_store(const void* batch, int slot, int bits, int negative, int item,
   store(b, lanes_of(b, 0, b.worlds), slot, bits, negative, item, data, apart);
 }
 
-// Pictures of one lane, row by row: red, green and blue of each cell in the three low bytes.
+// The colors of up to 64 cells whose ids have some bits. The palette has 256 colors.
+ALWAYS void colors_of(const uint8_t* ids, int bits, int count, const u32* palette, u32* out) {
+#if defined(__AVX512F__)
+  if (bits <= 5) {
+    const __m512i low = _mm512_loadu_si512(palette), high = _mm512_loadu_si512(palette + 16);
+    for (int x = 0; x < count; x += 16) {
+      const __m512i index = _mm512_cvtepu8_epi32(_mm_loadu_si128((const __m128i*)(ids + x)));
+      _mm512_mask_storeu_epi32(out + x, 0xffff >> std::max(0, 16 - (count - x)), _mm512_permutex2var_epi32(low, index, high));
+    }
+    return;
+  }
+#endif
+  for (int x = 0; x < count; x++) out[x] = palette[ids[x]];
+}
+// Pictures of one lane, row by row: red, green and blue of each cell in the three low bytes, 0 in the high one.
 static void paint_ids(const Batch& b, int lane, int slot, int bits, const u32* palette, u32* picture) {
   Planes p = planes_of(b.groups[lane / LANES], slot, bits, 0);
   each_run(b.g, [&](int i, int cell, int count) {
     uint8_t ids[64];
     cells_of(p, lane % LANES, i, ids);
-    for (int x = 0; x < count; x++) picture[cell + x] = palette[ids[x]];
+    colors_of(ids, bits, count, palette, picture + cell);
   });
 }
 
@@ -170,8 +184,9 @@ static void paint_tint(const Batch& b, int lane, int row, int column, const floa
     if (in[0] == in[1]) continue;  // both are zero
     for (int x = 0; x < g.width; x += CHUNK) {
       const F down = load(in[0], x), right = load(in[1], x);
-      const F share = smaller(root(down * down + right * right) / full, most), rest = 1.0f - share;
-      if (!bits_lt(splatf(0), share)) continue;
+      const F square = down * down + right * right;
+      if (!bits_lt(splatf(0), square)) continue;
+      const F share = smaller(root(square) / full, most), rest = 1.0f - share;
       const size_t bytes = sizeof(u32) * std::min(CHUNK, g.width - x);
       U before{}, after{};
       memcpy(&before, picture + x, bytes);
@@ -303,12 +318,13 @@ static void show_picture(const Batch& b, Lanes some, const View* views, int coun
     }
     uint8_t* pixel = out + views->offset + b.at(lane, apart, size * b.g.width);
     const u32 *color = picture.data(), *end = color + cells;
+#pragma GCC unroll 4
     for (; color < end - 2; color++, pixel += size) {
-      const u64 bytes = *color & 0xffffffu;
+      const u64 bytes = *color;
       memcpy(pixel, &bytes, 8);  // the next mend what is too much
     }
     for (; color < end; color++, pixel += size) {
-      const u64 bytes = *color & 0xffffffu;
+      const u64 bytes = *color;
       memcpy(pixel, &bytes, size);
     }
   }
@@ -336,41 +352,6 @@ static void show(const Batch& b, Lanes some, const View* views, int count, uint8
 API void pd_show(const void* batch, int count, const View* views, uint8_t* out, int64_t apart) {
   const Batch& b = *(const Batch*)batch;
   show(b, lanes_of(b, 0, b.worlds), views, count, out, apart);
-}
-
-// Cells of goals, [world][row][column], whose number is neither there nor in one of the four cells beside it, around edges.
-API void pd_missed(const void* batch, int slot, int bits, const uint8_t* goals, int64_t* counts) {
-  const Batch& b = *(const Batch*)batch;
-  const int height = b.g.world_height(), width = b.g.width, apart = width + 2;
-  constexpr u64 LOW = 0x7f7f7f7f7f7f7f7f;
-  std::vector<uint8_t> cells((size_t)height * width), wide((size_t)(height + 2) * apart + 8);
-  for (int i = 0; i < b.worlds; i++) {
-    store_values(b, lanes_of(b, i, i + 1), slot, bits, 0, cells.data(), 0);
-    for (int y = -1; y <= height; y++) {
-      const uint8_t* from = cells.data() + (size_t)((y + height) % height) * width;
-      uint8_t* row = wide.data() + (size_t)(y + 1) * apart;
-      row[0] = from[width - 1], row[width + 1] = from[0];
-      memcpy(row + 1, from, width);
-    }
-    int64_t sum = 0;
-    const uint8_t* cell = wide.data() + apart + 1;
-    for (int y = 0; y < height; y++, cell += apart)
-      for (int x = 0; x < width; x += 8) {  // eight cells in a word
-        const int count = std::min(8, width - x);
-        u64 goal = 0, missed = ~LOW;
-        if (count == 8) memcpy(&goal, goals, 8);
-        else memcpy(&goal, goals, count), missed >>= 8 * (8 - count);
-        const int places[] = {0, -1, 1, -apart, apart};
-#pragma GCC unroll 5
-        for (int k = 0; k < 5; k++) {
-          u64 found;
-          memcpy(&found, cell + x + places[k], 8);
-          missed &= (((found ^ goal) & LOW) + LOW) | (found ^ goal);  // the high bit of each byte that differs
-        }
-        sum += __builtin_popcountll(missed), goals += count;
-      }
-    counts[i] = sum;
-  }
 }
 
 // Numbers of cells where masks hold. A gate is a plane of the batch, a mask, or an operation on earlier gates. Masks are
