@@ -43,7 +43,7 @@ def both(task: Any, worlds: int, split: str = "train", plain: str = "native", **
     compiled = CompiledEnv(program, worlds, **how)
     if plain == "native":
         return TensorEnv(program, worlds, **how), compiled
-    return CompiledEnv(compile_task(task, backend=plain, split=split), worlds, **how), compiled
+    return CompiledEnv(compile_task(task, backend=plain, split=split).under(0), worlds, **how), compiled
 
 
 def random_actions(env: Any, draws: random.Random) -> Any:
