@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import ctypes
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -44,7 +44,7 @@ class CompiledSteps(Arguments):
             pictures=episodes.pictures.data_ptr(),
             goals=episodes.goal_ids.data_ptr() if episodes.mode == "task" else 0,
         )
-        self.set_fresh(structure, program.blocks, program.ids)
+        self.set_blocks(structure, program.blocks, program.ids)
         for name in ("colors", "lit"):
             setattr(structure, name, self.address(name, getattr(program, name)))
         for name in ("stage", "elapsed", "chosen", "errors"):
@@ -68,13 +68,11 @@ class CompiledSteps(Arguments):
         """Return the state of the episodes, moved to memory that steps write to if they have begun anew."""
         world = self._episodes.world
         assert world is not None
-        state: Any = world.state
         if world is not self._world:
             clock = {name: getattr(world, name).clone() for name in ("seed", "index", "step")}
-            if not (isinstance(state, PackedState) and state.program is self.native):
-                state = self.native.pack(state)
             for name, numbers in clock.items():
                 setattr(self._structure, name, numbers.data_ptr())
-            self._episodes.world = self._world = World(world.sim, state, *clock.values())
-        packed: PackedState = state
-        return packed
+            world = World(world.sim, self.native.pack(world.state), *clock.values())
+            self._episodes.world = self._world = world
+        state: PackedState = world.state  # type: ignore[assignment]
+        return state

@@ -142,8 +142,8 @@ class Arguments:
         self.arrays[name] = array = np.ascontiguousarray(values)
         return int(array.ctypes.data)
 
-    def set_fresh(self, structure: Any, blocks: Blocks, ids: Any) -> None:
-        """Describe new cells of the elements `ids`, int64 [n], which actions choose by their index."""
+    def set_blocks(self, structure: Any, blocks: Blocks, ids: Any) -> None:
+        """Describe the blocks that actions fill with one of the elements `ids`, int64 [n], chosen by index."""
         fresh = []
         for name, table in blocks.fresh.items():
             values = table.cpu()[ids]
@@ -220,7 +220,7 @@ class Plan(Arguments):
         else:
             play.column = self.address("column", columns)
         play.choices = self.address("choices", np.array(agent.choices, np.int64))
-        self.set_fresh(play, hands.blocks, np.array(agent.choices).clip(0))
+        self.set_blocks(play, hands.blocks, np.array(agent.choices).clip(0))
         speeds = [] if agent.speed_field is None else places.pieces[agent.speed_field]
         play.speed_row, play.speed_column = [places.homes[piece.slot][0] for piece in speeds] or (-1, -1)
         for name in ("each", "final", "success", "failure"):
@@ -246,9 +246,8 @@ class Stepper(Plan):
         `params` are float64 [B] each, as `TaskProgram.act` takes them; `kept` are an environment's tensors by the names of `Play`, [B] each: ``episode``,
         ``returned``, and ``waiting``, the episodes that are over.
         """
-        state, world, worlds = episodes.world.state, episodes.world, len(episodes)
-        if not (isinstance(state, PackedState) and state.program is self.native):
-            state = self.native.pack(state)
+        world, worlds = episodes.world, len(episodes)
+        state = self.native.pack(world.state)
         # Copies: `start` and `before`, and numbers of worlds, may be the same tensors.
         clock = [tensor.clone() for tensor in (world.seed, world.index, world.step)]
         names = ("seed", "acted", "failed", "start", "before")

@@ -210,7 +210,7 @@ static void run_group(Context& c, Batch& b, int number, long steps, const Clocks
     u32 key = 0;
     by_hash(c.world_keys[i], [&](int l) {
       const int world = c.worlds[l];
-      if (world != last) key = world_key(k.seed[world], k.index[world], i ? 0x85A308D3u : 0x243F6A88u), last = world;
+      if (world != last) key = world_key(k.seed[world], k.index[world], i), last = world;
       return key;
     });
   }

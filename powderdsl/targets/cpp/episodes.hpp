@@ -114,22 +114,24 @@ struct Results {  // one after another in memory
 };
 enum { TAKEN, LEFT, PAINTED, PLACED, BLOWN, ACTION_NUMBERS };
 
-// Cells of boxes that hold another element than `values`: added to `painted`, ACTION_NUMBERS apart.
-static void count_painted(const Play& p, Batch& b, const int64_t* boxes, const int64_t* values, int64_t* painted) {
+// Counts the cells of boxes that hold another element than the chosen one.
+static void count_painted(const Play& p, Batch& b, const int64_t* boxes, const int64_t* chosen) {
+  const Fresh* fresh = std::find_if(p.fresh, p.fresh + p.fresh_count, [&](const Fresh& f) { return f.bits && f.slot == p.element; });
+  const int64_t* ids = (const int64_t*)fresh->values;
   in_boxes(b, boxes, [&](Group& group, int lane, int world, int first, int last, const int64_t* box) {
     for (int w = 0; w < b.g.words; w++) {
       const int from = (int)std::max<int64_t>(box[2] - BITS * w, 0), to = (int)std::min<int64_t>(box[3] - BITS * w, BITS);
       for (int y = first; from < to && y < last; y++) {
         Word differs = 0;
         for (int i = 0; i < p.element_bits; i++)
-          differs |= (Word)word_of(group.slot[p.element + i], lane, y * b.g.words + w) ^ (values[world] >> i & 1 ? FULL : 0);
-        painted[world * ACTION_NUMBERS] += __builtin_popcountll((Word)(differs & (FULL >> (BITS - (to - from)) << from)));
+          differs |= (Word)word_of(group.slot[p.element + i], lane, y * b.g.words + w) ^ (ids[chosen[world]] >> i & 1 ? FULL : 0);
+        p.action[world * ACTION_NUMBERS + PAINTED] += __builtin_popcountll((Word)(differs & (FULL >> (BITS - (to - from)) << from)));
       }
     }
   });
 }
-// Fills boxes with new cells of the elements `chosen`. `before(fresh, values)` sees the whole numbers of each slot first.
-template <class P, class Before> static void place(const P& p, Batch& b, const int64_t* boxes, const int64_t* chosen, Before before) {
+// Fills boxes with new cells of the chosen elements.
+template <class P> static void place(const P& p, Batch& b, const int64_t* boxes, const int64_t* chosen) {
   std::vector<int64_t> values(b.worlds);
   std::vector<float> reals(b.worlds);
   for (int k = 0; k < p.fresh_count; k++) {
@@ -137,7 +139,7 @@ template <class P, class Before> static void place(const P& p, Batch& b, const i
     for (int i = 0; i < b.worlds; i++)
       if (fresh.bits) values[i] = ((const int64_t*)fresh.values)[chosen[i]];
       else reals[i] = ((const float*)fresh.values)[chosen[i]];
-    if (fresh.bits) before(fresh, values.data()), fill_values(b, fresh.slot, fresh.bits, boxes, values.data());
+    if (fresh.bits) fill_values(b, fresh.slot, fresh.bits, boxes, values.data());
     else fill_reals(b, fresh.slot, boxes, reals.data());
   }
 }
@@ -162,10 +164,8 @@ static void act(Play& p, Batch& b, const int64_t* actions) {
     for (int axis = 0; axis < 2; axis++)
       for (int end = 0; end < 2; end++) box[2 * axis + end] = p.edges[axis][2 * five[1 - axis] + end];
   }
-  if (places)
-    place(p, b, placed.data(), chosen.data(), [&](const Fresh& fresh, const int64_t* values) {
-      if (fresh.slot == p.element && p.counts_painted) count_painted(p, b, placed.data(), values, p.action + PAINTED);
-    });
+  if (places && p.counts_painted) count_painted(p, b, placed.data(), chosen.data());
+  if (places) place(p, b, placed.data(), chosen.data());
   for (int axis = 0; blows && axis < 2; axis++)
     if (p.speed_slots[axis] >= 0) fill_reals(b, p.speed_slots[axis], blown.data(), speeds[axis].data());
 }
@@ -310,7 +310,7 @@ API int pd_finish(Play* play) {
     r.reward[i] = (float)reward;
     p.returned[i] += (double)r.reward[i];
     r.terminated[i] = terminated, r.truncated[i] = truncated, r.succeeded[i] = success, r.ended[i] = ended;
-    r.active[i] = !waits, r.everyone[i] = true;  // again: callers may have changed the last ones
+    r.active[i] = !waits, r.everyone[i] = true;  // each time, since callers may change them
     r.episode_return[i] = (float)(p.returned[i] * ended);
     r.episode_length[i] = p.acted[i] * ended;
     r.last_shown[i] = p.world[i];

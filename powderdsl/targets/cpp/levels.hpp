@@ -1,5 +1,5 @@
-// Episodes of OGBench's levels: one call takes a choice in each; where it is the third of an action, the world runs a step
-// and a block is painted. Arrays are the caller's, with a row for each world; see targets/cpp/episodes.py. Comes after the
+// Episodes of OGBench's levels. One call takes a choice in each episode. After the third choice of an action, the world runs a
+// step and a block is painted. Arrays are the caller's, with a row for each world; see targets/cpp/episodes.py. Comes after the
 // episodes.
 
 struct Level {
@@ -22,8 +22,9 @@ struct Level {
   uint8_t* pictures;
 };
 static int64_t drawn_choice(const Level& p, int i, int64_t count) {  // as `keyed` of ogbench/episodes.py
-  u32 keys[2] = {0x243F6A88u, 0x85A308D3u};
-  for (u32& key : keys) key = mix(mix(world_key(p.seed[i], p.index[i], key) + (u32)p.elapsed[i]) + (u32)p.name);
+  u32 keys[2];
+  for (int half = 0; half < 2; half++)
+    keys[half] = mix(mix(world_key(p.seed[i], p.index[i], half) + (u32)p.elapsed[i]) + (u32)p.name);
   return (int64_t)((double)mix(mix(keys[0] ^ mix(keys[1]))) / 4294967296.0 * (double)count);
 }
 // Number of cells of a goal, [row][column], whose number is neither there in a world nor in one of the four cells beside it,
@@ -58,7 +59,7 @@ static int64_t missed_in(const Batch& b, int world, int slot, int bits, const ui
     }
   return sum;
 }
-// Takes a choice in the episodes that are `active`; those out of range are replaced.
+// Takes a choice in the episodes that are `active`. Choices out of range are replaced.
 API void pd_choose(Level* level, const int64_t* actions, const uint8_t* active) {
   Level& p = *level;
   Batch& b = *(Batch*)p.batch;
@@ -78,14 +79,14 @@ API void pd_choose(Level* level, const int64_t* actions, const uint8_t* active) 
   }
   if (painted.empty()) return;
   run_some(p, b, painted, 1);
-  place(p, b, boxes.data(), elements.data(), [](const Fresh&, const int64_t*) {});
+  place(p, b, boxes.data(), elements.data());
   const int64_t cells = (int64_t)b.g.world_height() * b.g.width;
   for (int i : painted) {
     show(b, lanes_of(b, i, i + 1), p.view, p.views, p.pictures, p.size);
     if (p.goals) p.errors[i] = missed_in(b, i, p.element, p.element_bits, p.goals + i * cells);
   }
 }
-// A picture with the same row over each of its own.
+// A picture, each of whose rows is combined with the same row.
 static void lay_over(const uint8_t* picture, const uint8_t* row, int64_t line, int64_t size, uint8_t* out) {
   typedef uint8_t Part __attribute__((vector_size(32), aligned(1), may_alias));
   for (const uint8_t* end = picture + size; picture < end; picture += line, out += line) {

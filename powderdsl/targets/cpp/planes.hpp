@@ -89,8 +89,9 @@ template <class T> ALWAYS T mix(T x) {
   x *= 0x846CA68Bu;
   return x ^ (x >> 16);
 }
-static u32 world_key(u64 seed, u64 index, u32 start) {  // of all steps and streams
-  return mix(mix(mix(start + (u32)seed) + (u32)(seed >> 32)) + (u32)index);
+static u32 world_key(u64 seed, u64 index, int half) {  // of all steps and streams
+  constexpr u32 INITIAL[] = {0x243F6A88u, 0x85A308D3u};
+  return mix(mix(mix(INITIAL[half] + (u32)seed) + (u32)(seed >> 32)) + (u32)index);
 }
 
 // Draws: bit j of 32 columns is one hash; a word has one or two, or the low bits of one. A plane's hashes start a constant after those of the plane before.

@@ -220,10 +220,9 @@ class NativeProgram(Places):
         state, (seed, index, start, since) = job.state, job.clock
         seed, index, start = seed.contiguous(), index.contiguous(), start.contiguous()
         inputs = self.inputs(job.params, len(start))
-        reuse = job.reuse
-        if not (isinstance(state, PackedState) and state.program is self):
-            state, reuse = self.pack(state), True
-        handle = state.take() if reuse else state.handle
+        packed = self.pack(state)
+        reuse = job.reuse or packed is not state
+        handle = packed.take() if reuse else packed.handle
         seconds = None if job.timing is None else (ctypes.c_double * len(self.code.passes))()
         handle = self.library.pd_run(
             handle, not reuse, job.steps, self.threads,
@@ -232,7 +231,7 @@ class NativeProgram(Places):
         if job.timing is not None and seconds is not None:
             for name, spent in zip(self.code.passes, seconds, strict=True):
                 job.timing.add(name, spent)
-        return PackedState(self, handle, state.like)
+        return PackedState(self, handle, packed.like)
 
     def inputs(self, params: Mapping[str, Tensor], batch: int) -> Inputs:
         """The inputs of some parameters, kept for the next call with the same mapping."""
@@ -246,7 +245,9 @@ class NativeProgram(Places):
         return inputs
 
     def pack(self, state: Mapping[str, Tensor]) -> PackedState:
-        """A state in native memory."""
+        """A state in this program's memory: the argument, if it already is."""
+        if isinstance(state, PackedState) and state.program is self:
+            return state
         handle: int = self.library.pd_new(*shape_of(state))
         for name, value in state.items():
             if not any(value.stride(axis) for axis in (0, -2, -1)) and not value[0, ..., 0, 0].any():
