@@ -33,7 +33,7 @@ from powderdsl.model.builtins import (
 )
 from powderdsl.model.composition.names import MAX_PASSES
 from powderdsl.model.declarations import COLOR
-from powderdsl.model.elaborate import MAX_MOMENTS, MAX_RULES
+from powderdsl.model.elaborate import MAX_RULES, MAX_SUBSTEPS
 from powderdsl.model.examples import MAX_SIDE
 from powderdsl.model.expressions.typer import MAX_ROUNDS, MAX_SET_DEPTH
 from powderdsl.model.operations import FUNCTIONS
@@ -138,7 +138,7 @@ def limits() -> str:
         ("nesting of sets", MAX_SET_DEPTH),
         ("nesting of `extends`", MAX_BASES),
         ("passes", MAX_PASSES),
-        ("substeps of a pass", MAX_MOMENTS),
+        ("substeps of a pass", MAX_SUBSTEPS),
         ("rules, after unrolling loops", MAX_RULES),
         ("rows or columns of a test", MAX_SIDE),
     ]

@@ -19,12 +19,12 @@ from powderdsl.model.types import (
     HERE,
     Assign,
     Expr,
-    Moment,
     Move,
     Offset,
     Pass,
     Rule,
     Ruleset,
+    Substep,
     Swap,
     Transform,
     alike,
@@ -74,7 +74,7 @@ class LineEffects:
 class SubstepSearch:
     """Searches for cells in which rules of a substep happen."""
 
-    moment: Moment
+    substep: Substep
     facts: Facts
     lets: dict[str, Expr]
 
@@ -101,7 +101,7 @@ class SubstepSearch:
         Under ``drop_both`` no other rule may claim its cells; under ``first_wins`` no transform before it may. An
         earlier swap or move that is wanted may itself be dropped, so that says nothing.
         """
-        policy = self.moment.policy
+        policy = self.substep.policy
         if policy in ("prove", "overwrite") or isinstance(rule, Assign):
             return []
         conditions: list[Condition] = []
@@ -110,7 +110,7 @@ class SubstepSearch:
             # pairs of one rule that share a cell: neither fires
             dy, dx = rule.offset
             conditions += [(negation(rule.mask), rule.offset), (negation(rule.mask), (-dy, -dx))]
-        for other in self.moment.rules:
+        for other in self.substep.rules:
             if isinstance(other, Assign):
                 continue
             if other is rule:
@@ -144,9 +144,9 @@ def facts_of(ruleset: Ruleset) -> Facts:
 def find_changes(ruleset: Ruleset, facts: Facts, *, together: bool = True) -> list[LineEffects]:
     """Effects of each line, in the order in which the lines first run; `together`: also of several at once."""
     effects_of: dict[RuleLine, LineEffects] = {}
-    for pass_, moment in substeps(ruleset.passes):
-        search = SubstepSearch(moment, facts, moment.values)
-        for rule in moment.rules:
+    for pass_, substep in substeps(ruleset.passes):
+        search = SubstepSearch(substep, facts, substep.values)
+        for rule in substep.rules:
             line = rule_line(rule, pass_)
             effects = effects_of.setdefault(line, LineEffects(line))
             if search.may(rule):
@@ -162,9 +162,9 @@ def find_changes(ruleset: Ruleset, facts: Facts, *, together: bool = True) -> li
 def may_rise_and_fall(ruleset: Ruleset, facts: Facts, number: int) -> tuple[bool, bool]:
     """True if some rule may turn other elements into an element and this one into others. Faster than `find_changes`."""
     rises = falls = False
-    for _, moment in substeps(ruleset.passes):
-        search = SubstepSearch(moment, facts, moment.values)
-        for rule in moment.rules:
+    for _, substep in substeps(ruleset.passes):
+        search = SubstepSearch(substep, facts, substep.values)
+        for rule in substep.rules:
             if isinstance(rule, Transform):
                 same = member(rule.target, (number,))
                 rises = rises or search.may(rule, element_is_not(number), (same, HERE))
@@ -253,7 +253,7 @@ def _joint_effects(search: SubstepSearch) -> tuple[list[Rule], Pairs]:
     kinds form rows, in which one element moves to the place that another leaves: the first of a row leaves its element
     behind, and the last overwrites one.
     """
-    policy, rules = search.moment.policy, search.moment.rules
+    policy, rules = search.substep.policy, search.substep.rules
     moves = [rule for rule in rules if isinstance(rule, Move)]
     kinds = {rule.offset if rule.leaving is None else rule.leaving.value for rule in moves}
     mixing: list[Rule] = [*moves] if policy == "prove" and len(kinds) > 1 else []
@@ -297,9 +297,9 @@ def find_requirements(ruleset: Ruleset, facts: Facts) -> dict[RuleLine, Requirem
     by_line: dict[RuleLine, Requirements] = {}
     for pass_ in ruleset.passes:
         lets: Lets = {}
-        for moment in pass_.moments:
-            search = SubstepSearch(moment, facts, moment.values)
-            for rule in moment.rules:
+        for substep in pass_.substeps:
+            search = SubstepSearch(substep, facts, substep.values)
+            for rule in substep.rules:
                 if search.may(rule):
                     requirements = _requirements(rule, search, lets | search.lets, named_ids)
                     line = rule_line(rule, pass_)
@@ -345,8 +345,8 @@ def named_by_fields(ruleset: Ruleset) -> frozenset[int]:
     """The ids that a field or a value under `let` may name although no cell ever contained them."""
     fields = [*ruleset.fields, *(item for pass_ in ruleset.passes for item in pass_.scratch)]
     ids = {int(value) for item in fields if item.kind == ELEMENT for value in item.defaults}
-    for _, moment in substeps(ruleset.passes):
-        values = [*moment.values.values(), *(w.value for rule in moment.rules for w in writes_of(rule))]
+    for _, substep in substeps(ruleset.passes):
+        values = [*substep.values.values(), *(w.value for rule in substep.rules for w in writes_of(rule))]
         nodes = [node for value in values if value.kind == ELEMENT for node in value.walk()]
         ids |= {int(node.value) for node in nodes if node.op == "const" and node.kind == ELEMENT}
     return frozenset(ids)
@@ -373,7 +373,7 @@ class ReducedWorld:
     def __init__(self, search: SubstepSearch, absent: frozenset[int], lets: Lets):
         self.absent = absent
         facts = replace(search.facts, ids=tuple(i for i in search.facts.ids if i not in absent))
-        self.search = SubstepSearch(replace(search.moment, rules=()), facts, {})
+        self.search = SubstepSearch(replace(search.substep, rules=()), facts, {})
         for name, value in lets.items():
             reduced = self.rewrite(value)
             if name in search.lets:
@@ -450,10 +450,10 @@ def find_overlaps(ruleset: Ruleset, facts: Facts) -> tuple[Overlap, ...]:
 
 
 def _candidates(ruleset: Ruleset, facts: Facts) -> Iterator[Candidate]:
-    for pass_, moment in substeps(ruleset.passes):
-        search = SubstepSearch(moment, facts, moment.values)
-        live = [rule for rule in moment.rules if search.may(rule)]
-        if moment.policy != "prove":
+    for pass_, substep in substeps(ruleset.passes):
+        search = SubstepSearch(substep, facts, substep.values)
+        live = [rule for rule in substep.rules if search.may(rule)]
+        if substep.policy != "prove":
             yield from _claims(search, pass_)
         yield from _writes(live, search, pass_)
     yield from _in_turn(ruleset)
@@ -462,10 +462,10 @@ def _candidates(ruleset: Ruleset, facts: Facts) -> Iterator[Candidate]:
 def _claims(search: SubstepSearch, pass_: Pass) -> Iterator[Candidate]:
     """Rules of one substep that may claim the same cell, where a policy decides."""
     # Rules that are always dropped meet others too: only the conditions count here.
-    movers = [rule for rule in search.moment.rules if not isinstance(rule, Assign)]
+    movers = [rule for rule in search.substep.rules if not isinstance(rule, Assign)]
     for i, second in enumerate(movers):
         for first in movers[: i + 1]:
-            outcome, same = _BY_POLICY[search.moment.policy], first is second
+            outcome, same = _BY_POLICY[search.substep.policy], first is second
             if same and outcome == "first wins":
                 outcome = "both dropped"
             if (same and isinstance(first, Move) and first.leaving is None) or (
@@ -485,7 +485,7 @@ def _ordered_pairs(items: Sequence[T]) -> Iterator[tuple[T, T]]:
 
 def _writes(rules: list[Rule], search: SubstepSearch, pass_: Pass) -> Iterator[Candidate]:
     """Writes of one field in one substep whose order affects the result. Rounding of floats is ignored."""
-    keeps_apart = search.moment.policy in ("drop_both", "first_wins")
+    keeps_apart = search.substep.policy in ("drop_both", "first_wins")
     for kind in (True, False):
         chosen = [rule for rule in rules if isinstance(rule, Assign) == kind]
         writes = [(write, rule) for rule in chosen for write in writes_of(rule)]
@@ -515,9 +515,9 @@ def _in_turn(ruleset: Ruleset) -> Iterator[Candidate]:
     """Transforms of different substeps that could happen to one cell of one world, with different results."""
     rules: list[tuple[int, RuleLine, Expr, Expr]] = []
     lets: Lets = {}
-    for number, (pass_, moment) in enumerate(substeps(ruleset.passes)):
-        lets |= {f"{name}@{number}": _number_lets(value, number) for name, value in moment.values.items()}
-        for rule in moment.rules:
+    for number, (pass_, substep) in enumerate(substeps(ruleset.passes)):
+        lets |= {f"{name}@{number}": _number_lets(value, number) for name, value in substep.values.items()}
+        for rule in substep.rules:
             if isinstance(rule, Transform):
                 rules.append((number, rule_line(rule, pass_), rule.target, _number_lets(rule.mask, number)))
     if len({line for _, line, _, _ in rules}) > MAX_LINES:

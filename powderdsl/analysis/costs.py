@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from powderdsl.ir.bits import PassForm, choose_form
 from powderdsl.ir.ops import OPS, REAL, Offset, PassGraph, Program, nodes_of
 
-WEIGHTS = {"gates": 1.0, "shifts": 4.0, "moves": 8.0, "random_bits": 8.0, "reals": 32.0, "dense": 200.0}
+WEIGHTS = {"gates": 1, "shifts": 4, "moves": 8, "random_bits": 8, "float_operations": 32, "dense": 200}
 """The cost of one operation of each kind, in vector operations on 512 cells. A vector holds 512 flags or sixteen floats;
 a random bit is a hash; passes on cells go through memory. The shares of the shipped rulesets agree with measurements of
 native code on worlds with all elements, mostly within a factor of two."""
@@ -19,20 +19,19 @@ class PassCost:
     """The cost of one pass. Counts are per cell and step.
 
     `gates` counts gates of flags and integers on bit planes, `shifts` the planes read at a neighbor, `moves` the planes
-    exchanged with one, `random_bits` the most bits that draws take, `reals` operations on float32. A pass on cells has
-    `dense` operations instead, with the reason (`why`) and the rule that causes it (`place`, ``file:line``). `share` is
-    an estimate.
+    exchanged with one, `random_bits` the most bits that draws take, `float_operations` those on float32. A pass on cells
+    has `dense` operations instead, with the reason (`why`) and the rule that causes it (`place`, ``file:line``). `share`
+    is an estimate.
     """
 
     name: str
     pack: str
-    moments: int
-    """Substeps, by their name in the output of `check --json`."""
+    substeps: int
     gates: int
     shifts: int
     moves: int
     random_bits: int
-    reals: int
+    float_operations: int
     dense: int
     neighbors: int
     form: str
@@ -51,7 +50,7 @@ def costs(program: Program) -> tuple[PassCost, ...]:
         PassCost(
             name=form.cells.name,
             pack=form.cells.pack,
-            moments=len(form.cells.substeps),
+            substeps=len(form.cells.substeps),
             **{kind: count[kind] for kind in WEIGHTS},
             neighbors=_neighbors(form.cells),
             form="planes" if form.planes else "cells",
@@ -75,7 +74,7 @@ def _work(form: PassForm) -> Counter[str]:
         if form.planes is None:
             count["dense"] += bool(node.args)
         elif node.type == REAL or any(arg.type == REAL for arg in node.args):
-            count["reals"] += bool(node.args)
+            count["float_operations"] += bool(node.args)
         else:
             count["gates"] += OPS[node.op].gates
             count["shifts"] += node.op == "shift"

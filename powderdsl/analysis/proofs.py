@@ -13,11 +13,11 @@ from powderdsl.model.types import (
     Claim,
     Expr,
     Local,
-    Moment,
     Move,
     Never,
     Offset,
     Ruleset,
+    Substep,
     Swap,
     Total,
     Transform,
@@ -75,25 +75,25 @@ def horizon(ruleset: Ruleset) -> int:
     seen = 0
     for pass_ in ruleset.passes:
         lets: dict[str, int] = {}
-        for moment in pass_.moments:
-            for let in moment.lets:
+        for substep in pass_.substeps:
+            for let in substep.lets:
                 lets[let.name] = _sight(let.value, seen, lets)
-            seen = _substep_reach(moment, seen, lets)
+            seen = _substep_reach(substep, seen, lets)
     return seen
 
 
-def _substep_reach(moment: Moment, seen: int, lets: Mapping[str, int]) -> int:
-    claims = [rule for rule in moment.rules if not isinstance(rule, Assign)]
-    masks = {id(rule): _sight(rule.mask, seen, lets) for rule in moment.rules}
+def _substep_reach(substep: Substep, seen: int, lets: Mapping[str, int]) -> int:
+    claims = [rule for rule in substep.rules if not isinstance(rule, Assign)]
+    masks = {id(rule): _sight(rule.mask, seen, lets) for rule in substep.rules}
     reaches = [_length(rule.offset) for rule in claims if not isinstance(rule, Transform)]
-    if moment.policy in ("drop_both", "first_wins") and claims:
+    if substep.policy in ("drop_both", "first_wins") and claims:
         # A rule depends on the cells that others claim; under `first_wins`, these in turn depend on earlier rules.
-        rounds = len(claims) if moment.policy == "first_wins" and reaches else 1
+        rounds = len(claims) if substep.policy == "first_wins" and reaches else 1
         widest = max(masks[id(rule)] for rule in claims)
         wide = widest + 2 * max(reaches, default=0) * rounds
         masks |= {id(rule): wide for rule in claims}
     distances = [seen]
-    for rule in moment.rules:
+    for rule in substep.rules:
         mask = masks[id(rule)]
         for write in writes_of(rule):
             distances.append(_length(write.offset) + max(mask, _sight(write.value, seen, lets)))

@@ -35,13 +35,13 @@ from powderdsl.model.types import (
     Expr,
     Kernel,
     Kind,
-    Moment,
     Move,
     Offset,
     Pass,
     Property,
     Rule,
     Ruleset,
+    Substep,
     Swap,
     Transform,
     Value,
@@ -375,11 +375,11 @@ def live_passes(ruleset: Ruleset) -> tuple[Pass, ...]:
     """The passes without rules whose conditions cannot hold: a loop writes many copies, few of which fit the elements."""
     facts = replace(facts_of(ruleset), budget=Budget(LIVE_BUDGET))
 
-    def live(moment: Moment) -> Moment:
-        rules = [rule for rule in moment.rules if satisfiable(facts, [(rule.mask, HERE)], moment.values)]
-        return replace(moment, rules=tuple(rules))
+    def live(substep: Substep) -> Substep:
+        rules = [rule for rule in substep.rules if satisfiable(facts, [(rule.mask, HERE)], substep.values)]
+        return replace(substep, rules=tuple(rules))
 
-    return tuple([replace(pass_, moments=tuple(map(live, pass_.moments))) for pass_ in ruleset.passes])
+    return tuple([replace(pass_, substeps=tuple(map(live, pass_.substeps))) for pass_ in ruleset.passes])
 
 
 class _PassLowering:
@@ -402,7 +402,7 @@ class _PassLowering:
         for slot, part in self.parts:
             if slot.name in self.scratch:
                 self.state[part.name] = build.const(part.default, part.type)
-        substeps = tuple(map(self.substep, self.pass_.moments))
+        substeps = tuple(map(self.substep, self.pass_.substeps))
         outputs = []
         for slot, part in self.parts:
             last = self.state[part.name]
@@ -416,16 +416,16 @@ class _PassLowering:
     def inputs(self) -> Inputs:
         return Inputs(self.ruleset, self.build, dict(self.state))
 
-    def substep(self, moment: Moment) -> SubstepGraph:
-        place = next((f"{r.span.source.name}:{r.span.line}" for r in moment.rules), "")
+    def substep(self, substep: Substep) -> SubstepGraph:
+        place = next((f"{r.span.source.name}:{r.span.line}" for r in substep.rules), "")
         self.build.place = place
-        for let in moment.lets:
+        for let in substep.lets:
             names = part_names(f"let {let.name}", let.value.kind)
             self.state |= zip(names, lower_expression(let.value, self.inputs()), strict=True)
         at = self.inputs()
-        claims: list[Claim] = [(rule, node(rule.mask, at)) for rule in moment.rules]
-        if moment.policy in ("drop_both", "first_wins"):
-            claims = self._keep_apart(claims, moment.policy)
+        claims: list[Claim] = [(rule, node(rule.mask, at)) for rule in substep.rules]
+        if substep.policy in ("drop_both", "first_wins"):
+            claims = self._keep_apart(claims, substep.policy)
         movers = [(rule, mask) for rule, mask in claims if not isinstance(rule, Assign)]
         assigns = [(rule, mask) for rule, mask in claims if isinstance(rule, Assign)]
         # All values are those before the substep; effects are written after the movements.
@@ -440,11 +440,11 @@ class _PassLowering:
         before = dict(self.state)
         for write in writes:
             self._assign(*write)
-        self._move(movers, at, moment.policy)
+        self._move(movers, at, substep.policy)
         for effect in effects:
             self._assign(*effect)
         changed = tuple((name, new) for name, new in self.state.items() if before[name] is not new)
-        return SubstepGraph(moment.label, place, changed, tuple(mask for _, mask in claims))
+        return SubstepGraph(substep.label, place, changed, tuple(mask for _, mask in claims))
 
     def _assign(self, write: Assign, mask: Node, value: Parts) -> None:
         """`field op value` at an offset from each cell of the mask, read from the target's side."""

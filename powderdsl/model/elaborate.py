@@ -38,19 +38,19 @@ from powderdsl.model.types import (
     Field,
     Kind,
     Let,
-    Moment,
     Move,
     Offset,
     Pass,
     Rule,
     Stream,
+    Substep,
     Swap,
     Transform,
 )
 from powderdsl.syntax.parse import Syntax
 from powderdsl.system.random import name_number
 
-MAX_MOMENTS = 1000
+MAX_SUBSTEPS = 1000
 MAX_RULES = 5000
 MAX_TRIED = 4 * MAX_RULES
 """Rules, with all their copies, and loops, including wrong, inactive and repeated ones."""
@@ -102,7 +102,7 @@ class Elaborator:
         self._empty_lets: set[str] = set()
         self._lets: dict[str, int] = {}
         self._pending: list[Let] = []
-        self._moments: list[Moment] = []
+        self._substeps: list[Substep] = []
         self._scratch: list[Field] = []
         for block in decl.walk():
             for rule in block.rules:
@@ -112,8 +112,8 @@ class Elaborator:
             scope = scope.bind(**{item.name.text: self._scratch_field(item, scope)})
         self._block(decl, scope, "", None, None)
         if self._pending:
-            self._moments.append(Moment(tuple(self._pending), (), "prove", ""))
-        return Pass(name, decl.pack, tuple(self._scratch), tuple(self._moments), decl.span)
+            self._substeps.append(Substep(tuple(self._pending), (), "prove", ""))
+        return Pass(name, decl.pack, tuple(self._scratch), tuple(self._substeps), decl.span)
 
     def _scratch_field(self, decl: ScratchDecl, scope: Scope) -> Operand:
         name, span = f"{self._name}.{decl.name.text}", decl.name.span
@@ -144,7 +144,7 @@ class Elaborator:
             )  # fmt: skip
         for inner, inner_label in rounds:
             if block.rules:
-                self._moment(block.rules, inner, inner_label, symmetry, policy)
+                self._substep(block.rules, inner, inner_label, symmetry, policy)
             for child in block.blocks:
                 self._block(child, inner, inner_label, symmetry, policy)
         for child in block.then:
@@ -199,7 +199,7 @@ class Elaborator:
         self._pending.append(Let(unique, value, syntax.span))
         return Expr("let", value.kind, value=unique, span=syntax.span)
 
-    def _moment(
+    def _substep(
         self, rules: tuple[Syntax, ...], scope: Scope, label: str, symmetry: str | None, policy: str | None
     ) -> None:
         self._label = label
@@ -213,14 +213,14 @@ class Elaborator:
             typed += copies
         self._rules += len(typed)
         self._spend(0, rules[0].span)
-        self._moments.append(Moment(tuple(self._pending), tuple(typed), policy or "prove", label))
+        self._substeps.append(Substep(tuple(self._pending), tuple(typed), policy or "prove", label))
         self._pending = []
 
     def _spend(self, tries: int, span: Span) -> None:
         """Count rules and blocks. Raises Poisoned after reporting that loops unroll to too many."""
         self._tried += tries
-        if self._tried > MAX_TRIED or self._rules > MAX_RULES or len(self._moments) >= MAX_MOMENTS:
-            message = f"loops unroll to more than {MAX_MOMENTS} substeps or {MAX_RULES} rules"
+        if self._tried > MAX_TRIED or self._rules > MAX_RULES or len(self._substeps) >= MAX_SUBSTEPS:
+            message = f"loops unroll to more than {MAX_SUBSTEPS} substeps or {MAX_RULES} rules"
             raise self.typer.fail("PD508", message, span, "here", "loop over fewer things")
 
     # Rules

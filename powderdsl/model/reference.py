@@ -21,13 +21,13 @@ from powderdsl.model.types import (
     Expr,
     Kernel,
     Kind,
-    Moment,
     Move,
     Offset,
     Pass,
     Property,
     Rule,
     Ruleset,
+    Substep,
     Swap,
     Transform,
 )
@@ -147,7 +147,7 @@ class Change(NamedTuple):
 class Watch(Protocol):
     """Receives the events of a step. Contexts are mutated after each event."""
 
-    def begins(self, moment: Moment, at: Context, masks: Mapping[int, Array]) -> None:
+    def begins(self, substep: Substep, at: Context, masks: Mapping[int, Array]) -> None:
         """The lets of a substep are fixed; `masks` has the cells in which each rule will fire, by `id`."""
 
     def wrote(self, change: Change, before: Array, after: Array, mask: Array | None = None) -> None:
@@ -326,15 +326,15 @@ def octant(v: Array) -> Array:
 # Substeps
 
 
-def run_moment(moment: Moment, at: Context, table: Mapping[str, Slot]) -> State:
+def run_substep(substep: Substep, at: Context, table: Mapping[str, Slot]) -> State:
     """The state after one simultaneous sub-step. `at.lets` gains the substep's lets."""
-    for let in moment.lets:
+    for let in substep.lets:
         at.lets[let.name] = evaluate(let.value, at)
-    masks = masks_of(moment, at)
+    masks = masks_of(substep, at)
     if at.watch is not None:
-        at.watch.begins(moment, at, masks)
-    claims = [rule for rule in moment.rules if not isinstance(rule, Assign)]
-    assigns = [rule for rule in moment.rules if isinstance(rule, Assign)]
+        at.watch.begins(substep, at, masks)
+    claims = [rule for rule in substep.rules if not isinstance(rule, Assign)]
+    assigns = [rule for rule in substep.rules if isinstance(rule, Assign)]
     effects = [(rule, effect) for rule in claims for effect in rule.effects]
     values = {
         id(write): evaluate(write.value, at) for write in (*assigns, *(effect for _, effect in effects))
@@ -389,12 +389,12 @@ def run_moment(moment: Moment, at: Context, table: Mapping[str, Slot]) -> State:
     return state
 
 
-def masks_of(moment: Moment, at: Context) -> dict[int, Array]:
+def masks_of(substep: Substep, at: Context) -> dict[int, Array]:
     """The cells in which each rule of a substep fires, bool [B, H, W] by `id`. `at.lets` has the substep's lets."""
-    masks = {id(rule): evaluate(rule.mask, at) for rule in moment.rules}
-    if moment.policy in ("drop_both", "first_wins"):
-        claims = [rule for rule in moment.rules if not isinstance(rule, Assign)]
-        _settle_claims(moment.policy, claims, masks)
+    masks = {id(rule): evaluate(rule.mask, at) for rule in substep.rules}
+    if substep.policy in ("drop_both", "first_wins"):
+        claims = [rule for rule in substep.rules if not isinstance(rule, Assign)]
+        _settle_claims(substep.policy, claims, masks)
     return masks
 
 
@@ -475,8 +475,8 @@ def run_pass(pass_: Pass, at: Context, table: Mapping[str, Slot]) -> State:
     at.state = {**at.state, **{name: _fresh(slot, at.shape) for name, slot in scratch.items()}}
     at.lets = {}
     everything = {**table, **scratch}
-    for moment in pass_.moments:
-        at.state = run_moment(moment, at, everything)
+    for substep in pass_.substeps:
+        at.state = run_substep(substep, at, everything)
     after = clamp({name: value for name, value in at.state.items() if name in table}, table)
     if at.watch is not None:
         for name, slot in table.items():

@@ -20,12 +20,12 @@ from powderdsl.model.types import (
     Field,
     Kernel,
     Kind,
-    Moment,
     Move,
     Offset,
     Pass,
     Rule,
     Ruleset,
+    Substep,
     Swap,
     Transform,
     Value,
@@ -239,16 +239,16 @@ class _Printer:
         yield self.with_place(f"pass {pass_.name} of {pass_.pack}", pass_.span)
         for item in pass_.scratch:
             yield self.with_place(f"  scratch {item.name} {item.kind}", item.span)
-        for moment in pass_.moments:
-            yield from self.moment_lines(moment)
+        for substep in pass_.substeps:
+            yield from self.substep_lines(substep)
 
-    def moment_lines(self, moment: Moment) -> Iterator[str]:
-        label = f" [{moment.label}]" if moment.label else ""
-        policy = "" if moment.policy == "prove" else f" conflicts {moment.policy}"
+    def substep_lines(self, substep: Substep) -> Iterator[str]:
+        label = f" [{substep.label}]" if substep.label else ""
+        policy = "" if substep.policy == "prove" else f" conflicts {substep.policy}"
         yield f"  substep{label}{policy}"
-        for let in moment.lets:
+        for let in substep.lets:
             yield self.with_place(f"    let {let.name}: {let.value.kind} = {self.expr(let.value)}", let.span)
-        for rule in moment.rules:
+        for rule in substep.rules:
             yield self.with_place(f"    {self.rule(rule)}", rule.span)
 
     def rule(self, rule: Rule) -> str:

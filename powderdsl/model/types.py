@@ -294,7 +294,7 @@ class Let:
 
 
 @dataclass(frozen=True)
-class Moment:
+class Substep:
     """One simultaneous sub-step: first `lets` in order, then all `rules`, which read the world before.
 
     Writes land in this order: assignments, then transforms, swaps and moves, then effects.
@@ -320,15 +320,15 @@ class Pass:
     name: str
     pack: str
     scratch: tuple[Field, ...]
-    moments: tuple[Moment, ...]
+    substeps: tuple[Substep, ...]
     span: Span = field(compare=False, repr=False)
 
 
-def substeps(passes: Iterable[Pass]) -> Iterator[tuple[Pass, Moment]]:
+def substeps(passes: Iterable[Pass]) -> Iterator[tuple[Pass, Substep]]:
     """Every substep with its pass, in execution order."""
     for pass_ in passes:
-        for moment in pass_.moments:
-            yield pass_, moment
+        for substep in pass_.substeps:
+            yield pass_, substep
 
 
 Cell = tuple[tuple[float, float], ...] | None

@@ -13,7 +13,7 @@ from powderdsl.ir.ops import REAL, PassGraph, Program
 from powderdsl.ir.text import structure
 from powderdsl.model.state import Slot, fresh_values, slots
 from powderdsl.model.types import Ruleset
-from powderdsl.prover.induction import HERE, MAX_WHOLE, Moment, growing_ranges
+from powderdsl.prover.induction import HERE, MAX_WHOLE, Transition, growing_ranges
 from powderdsl.prover.net import Literal
 from powderdsl.prover.solver import OutOfWork
 from powderdsl.prover.symbolic import (
@@ -33,9 +33,9 @@ from powderdsl.prover.symbolic import (
 
 @dataclass(frozen=True)
 class Difference:
-    """A question whose answer is a world on which some passes differ, in some slots; its model is that of `moment`."""
+    """A question whose answer is a world on which some passes differ, in some slots; its model is that of `transition`."""
 
-    moment: Moment
+    transition: Transition
     passes: tuple[tuple[int, ...], tuple[int, ...]]
     """The numbers of the passes of each ruleset."""
 
@@ -181,13 +181,13 @@ def _differ(
             for name, (lo, hi) in first_ranges.items()
             if name in theirs
         }
-    moment = Moment("passes", symbols, (before,), before, afters[0], known)
+    transition = Transition("passes", symbols, (before,), before, afters[0], known)
     net = symbols.net
     wrong = []
     for plane, is_real in planes.items():
         if is_real:
             terms = (world.real(plane, *HERE) for world in afters)
-            wrong.append(moment.questions.equal_floats(*terms) ^ 1)
+            wrong.append(transition.questions.equal_floats(*terms) ^ 1)
     for name in shared:
         rows = [row[name] for row in own]
         if any(plane in planes for row in rows for plane in row.planes):
@@ -195,7 +195,7 @@ def _differ(
             wrong += map(
                 net.xor, *(_extended(world, row, count) for world, row in zip(afters, rows, strict=True))
             )
-    return Difference(moment, numbers) if moment.can_be([net.any(wrong)]) else None
+    return Difference(transition, numbers) if transition.can_be([net.any(wrong)]) else None
 
 
 def _extended(world: World, row: Layout, count: int) -> list[Literal]:

@@ -40,12 +40,14 @@ ARRIVING = [(0, -1), (1, -1), (2, 0)]
 READS = {"shift": [(0, 1)], "swap": [*ARRIVING, (0, 1), (1, 0)], "arrive": ARRIVING}
 """The cells in which a node reads its arguments: at its offset (1), opposite to it (-1) or here (0)."""
 
-Law = Callable[["Moment", World, Cell], Literal]
-"""Returns a literal that is true if a claim holds at a cell of a world of a moment."""
+Check = Callable[["Transition"], bool]
+Law = Callable[["Transition", World, Cell], Literal]
+"""Returns a literal that is true if a claim holds at a cell of a world of a transition."""
+Laws = Sequence[Law]
 
 
 @dataclass(eq=False)
-class Moment:
+class Transition:
     """A pass, a substep or the start of a step: the worlds before and after it, and questions about them."""
 
     name: str
@@ -59,7 +61,7 @@ class Moment:
     moves: tuple[tuple[Node, Offset], ...] = ()
     """Flags of cells that exchange something with a neighbor, and the offset of that neighbor."""
     only_moves: bool | None = None
-    """True if the moment only exchanges elements between cells; None if that is unknown."""
+    """True if the transition only exchanges elements between cells; None if that is unknown."""
     model: Model | None = None
     """The answer to the last question, if any."""
     _facts: dict[object, list[Literal]] = field(default_factory=dict)
@@ -74,7 +76,7 @@ class Moment:
         evaluation = self._evaluations.setdefault(id(world), Evaluation(world, self.symbols))
         return evaluation.value(node, *cell)
 
-    def keeps(self, law: Law, given: Sequence[Law] = ()) -> bool:
+    def keeps(self, law: Law, given: Laws = ()) -> bool:
         """Return whether the law holds in a cell afterwards if it held in all cells before. Raises OutOfWork,
         Undecided."""
         broken = law(self, self.after, HERE) ^ 1
@@ -133,7 +135,7 @@ class Prover:
         self.program = lower(ruleset)
         self.planes = [lower_pass(self.program, pass_) for pass_ in self.program.passes]
         self.ranges = growing_ranges(self.program)
-        self._moments: dict[tuple[int, bool], list[Moment]] = {}
+        self._transitions: dict[tuple[int, bool], list[Transition]] = {}
         self._laws: dict[frozenset[int], Law] = {}
         self._failures: list[int] = []
         """Passes in which sums could not be proven."""
@@ -142,13 +144,13 @@ class Prover:
         return Symbols(self.ruleset, self.program, self.budget, limit)
 
     @cached_property
-    def start(self) -> Moment:
+    def start(self) -> Transition:
         """The start of a step, where slots are reset."""
         before = Before(symbols := self._symbols())
-        return Moment("start", symbols, (before,), before, Reset(before, symbols))
+        return Transition("start", symbols, (before,), before, Reset(before, symbols))
 
-    def broken_by(self, check: Callable[[Moment], bool], *, everywhere: bool = False) -> Moment | None:
-        """The first moment of a step that fails a check. Unless the check must hold `everywhere`, it may hold for a
+    def broken_by(self, check: Check, *, everywhere: bool = False) -> Transition | None:
+        """The first transition of a step that fails a check. Unless the check must hold `everywhere`, it may hold for a
         whole pass."""
         if not check(self.start):
             return self.start
@@ -157,7 +159,7 @@ class Prover:
             failed = next((m for place in places if (m := self._failed(number, place, check))), None)
             if failed is None:
                 continue
-            whole = failed if everywhere or len(places) == 1 else self.moments(number, cut=False)[-1]
+            whole = failed if everywhere or len(places) == 1 else self.transitions(number, cut=False)[-1]
             try:
                 if whole is failed or not check(whole):
                     return whole
@@ -165,29 +167,29 @@ class Prover:
                 return failed
         return None
 
-    def _failed(self, number: int, place: int, check: Callable[[Moment], bool]) -> Moment | None:
+    def _failed(self, number: int, place: int, check: Check) -> Transition | None:
         """None if a substep passes a check: from any well-formed world, or from the results of the substeps before it."""
         failed = None
         for cut in (True, False) if place else (False,):
-            moment = self.moments(number, cut=cut)[place]
+            transition = self.transitions(number, cut=cut)[place]
             try:
-                if check(moment):
+                if check(transition):
                     return None
-                failed = moment
+                failed = transition
             except (Undecided, OutOfWork):
                 if failed is None:
                     raise
         return failed
 
-    def moments(self, number: int, *, cut: bool) -> list[Moment]:
+    def transitions(self, number: int, *, cut: bool) -> list[Transition]:
         """The substeps of a pass, from any well-formed world if `cut`; otherwise from the results of earlier ones,
         followed by the pass as a whole."""
-        if (number, cut) not in self._moments:
-            self._moments[number, cut] = self._make_moments(number, cut)
-        return self._moments[number, cut]
+        if (number, cut) not in self._transitions:
+            self._transitions[number, cut] = self._make_transitions(number, cut)
+        return self._transitions[number, cut]
 
-    def _make_moments(self, number: int, cut: bool) -> list[Moment]:
-        moments = []
+    def _make_transitions(self, number: int, cut: bool) -> list[Transition]:
+        transitions = []
         pass_, ranges = self.planes[number], self.ranges[number + cut]
         state, known = dict[str, Node](), dict[Node, tuple[str, str]]()
         row = self.start.symbols.layouts["element"]
@@ -205,15 +207,15 @@ class Prover:
             after = evaluation.after([*state.items(), *ends])
             starts = (begin, before) if cut else (begin,)
             name = f"{pass_.name}.{place}" if len(pass_.substeps) > 1 else pass_.name
-            moments.append(Moment(name, symbols, starts, before, after, ranges, evaluation, moves))
+            transitions.append(Transition(name, symbols, starts, before, after, ranges, evaluation, moves))
             for plane, node in substep.writes:
                 if node.op not in ("input", "const"):
                     known.setdefault(node, (f"{place}", plane))
-        whole = Moment(pass_.name, symbols, (begin,), begin, moments[-1].after, ranges)
-        return moments if cut else [*moments, whole]
+        whole = Transition(pass_.name, symbols, (begin,), begin, transitions[-1].after, ranges)
+        return transitions if cut else [*transitions, whole]
 
-    def broken(self, claim: Claim, without: frozenset[int] = frozenset()) -> Moment | None:
-        """Return None if the claim is proven for worlds that start without some elements; else a moment that may
+    def broken(self, claim: Claim, without: frozenset[int] = frozenset()) -> Transition | None:
+        """Return None if the claim is proven for worlds that start without some elements; else a transition that may
         break it, with a model of how. Raises OutOfWork and Undecided."""
         given = [self.reachable(without)] if without else []
         passes = range(len(self.planes))
@@ -224,16 +226,16 @@ class Prover:
                 for number in sorted(
                     passes, key=self._failures.count, reverse=True
                 ):  # passes that failed before come first
-                    if moment := self._counted(number, ids, claim.trend, given):
+                    if transition := self._counted(number, ids, claim.trend, given):
                         self._failures.append(number)
-                        return moment
+                        return transition
                 return None
             case Symmetric():
                 turned = (self._symmetric(number, claim.turn) for number in passes)
-                return next((moment for moment in turned if moment), None)
+                return next((transition for transition in turned if transition), None)
             case Never(steps=1) | Bounded():
                 law = self._law(claim)
-                return self.broken_by(lambda moment: moment.keeps(law, given))
+                return self.broken_by(lambda transition: transition.keeps(law, given))
             case Never():
                 return self._never_for(claim, given)
             case Local() if self._reach() <= claim.radius:
@@ -251,11 +253,11 @@ class Prover:
     def _law(self, claim: Never | Bounded) -> Law:
         if isinstance(claim, Never):
             condition = self._condition(claim)
-            return lambda moment, world, cell: moment.condition(condition, world, cell) ^ 1
+            return lambda transition, world, cell: transition.condition(condition, world, cell) ^ 1
         row = self.start.symbols.layouts.get(claim.field)
         if row is None:
             raise Undecided("bounds of floats")
-        return lambda moment, world, cell: moment.symbols.net.within(
+        return lambda transition, world, cell: transition.symbols.net.within(
             row.bits(world, *cell), claim.lo, claim.hi, signed=row.signed
         )
 
@@ -271,25 +273,25 @@ class Prover:
         # A field's usual element, absent or not, is in fresh cells and in cells that can contain no other.
         allowed = {row.slot.name: known | {row.usual[i] or 0 for i in known} for row in rows}
 
-        def law(moment: Moment, world: World, cell: Cell) -> Literal:
-            net = moment.symbols.net
+        def law(transition: Transition, world: World, cell: Cell) -> Literal:
+            net = transition.symbols.net
             return net.all(net.member(row.bits(world, *cell), allowed[row.slot.name]) for row in rows)
 
-        # Elements that a moment adds are allowed from now on.
-        while moment := self.broken_by(lambda moment: moment.keeps(law), everywhere=True):
+        # Elements that a transition adds are allowed from now on.
+        while transition := self.broken_by(lambda transition: transition.keeps(law), everywhere=True):
             for row in rows:
-                bits = map(moment.questions.holds, row.bits(moment.after, *HERE))
+                bits = map(transition.questions.holds, row.bits(transition.after, *HERE))
                 allowed[row.slot.name].add(sum(bit << i for i, bit in enumerate(bits)))
         return law
 
-    def _never_for(self, claim: Never, given: Sequence[Law]) -> Moment | None:
+    def _never_for(self, claim: Never, given: Laws) -> Transition | None:
         """Return whether a condition can hold in a cell for several successive steps."""
         if claim.steps > 2 and any(map(_reads_clock, self.planes)):
             raise Undecided("the clock")
         symbols, condition = self._symbols(), self._condition(claim)
         start: World = Before(symbols)
-        moment = Moment("steps", symbols, (start,), start, start)
-        world, holds = start, [moment.condition(condition, start, HERE)]
+        transition = Transition("steps", symbols, (start,), start, start)
+        world, holds = start, [transition.condition(condition, start, HERE)]
         for step in range(claim.steps - 1):
             names = Names(
                 streams={s.name: f"{s.name} {step}" for s in self.ruleset.streams}
@@ -297,58 +299,59 @@ class Prover:
             world = Reset(world, symbols)
             for pass_ in self.planes:
                 world = Evaluation(world, symbols, names).after(pass_.outputs)
-            holds.append(moment.condition(condition, world, HERE))
-        return moment if moment.can_be(holds, given) else None
+            holds.append(transition.condition(condition, world, HERE))
+        return transition if transition.can_be(holds, given) else None
 
-    def well_formed(self) -> Moment | None:
+    def well_formed(self) -> Transition | None:
         """The first pass or substep that may leave a cell that is not well-formed; None if there is none."""
 
-        def keeps(moment: Moment) -> bool:
-            after, before = (moment.symbols.well_formed(w, HERE) for w in (moment.after, moment.before))
+        def keeps(transition: Transition) -> bool:
+            worlds = transition.after, transition.before
+            after, before = (transition.symbols.well_formed(world, HERE) for world in worlds)
             facts = (fact for fact, same in zip(after, before, strict=True) if fact != same)
-            return not moment.can_be([moment.symbols.net.all(facts) ^ 1])
+            return not transition.can_be([transition.symbols.net.all(facts) ^ 1])
 
         return self.broken_by(keeps, everywhere=True)
 
-    def _unchanging(self, ids: frozenset[int], given: Sequence[Law], moment: Moment) -> bool:
-        net, row = moment.symbols.net, moment.symbols.layouts["element"]
-        before, after = (row.bits(world, *HERE) for world in (moment.before, moment.after))
+    def _unchanging(self, ids: frozenset[int], given: Laws, transition: Transition) -> bool:
+        net, row = transition.symbols.net, transition.symbols.layouts["element"]
+        before, after = (row.bits(world, *HERE) for world in (transition.before, transition.after))
         changed = net.any(map(net.xor, before, after))
-        return not moment.can_be([net.member(before, ids), changed], given)
+        return not transition.can_be([net.member(before, ids), changed], given)
 
-    def _counted(self, number: int, ids: frozenset[int], trend: str, given: Sequence[Law]) -> Moment | None:
+    def _counted(self, number: int, ids: frozenset[int], trend: str, given: Laws) -> Transition | None:
         """The first substep of a pass that may change the number of cells with some elements against a trend."""
         planes = self.start.symbols.layouts["element"].planes
         changing = [
             i for i, s in enumerate(self.planes[number].substeps) if any(p in planes for p, _ in s.writes)
         ]
 
-        def keeps(moment: Moment) -> bool:
-            return self._only_moves(moment) or self._matched(moment, ids, trend, given)
+        def keeps(transition: Transition) -> bool:
+            return self._only_moves(transition) or self._matched(transition, ids, trend, given)
 
-        return next((moment for i in changing if (moment := self._failed(number, i, keeps))), None)
+        return next((transition for i in changing if (transition := self._failed(number, i, keeps))), None)
 
-    def _only_moves(self, moment: Moment) -> bool:
+    def _only_moves(self, transition: Transition) -> bool:
         """Return whether a substep only exchanges elements between cells, which changes no number."""
-        if moment.only_moves is not None:
-            return moment.only_moves
-        net, row = moment.symbols.net, moment.symbols.layouts["element"]
+        if transition.only_moves is not None:
+            return transition.only_moves
+        net, row = transition.symbols.net, transition.symbols.layouts["element"]
 
         def differ(world: World, cell: Cell, other: World, place: Cell) -> Literal:
             return net.any(map(net.xor, row.bits(world, *cell), row.bits(other, *place)))
 
         def breaks(cells: Sequence[Cell]) -> Literal:
             pairs = zip(cells, reversed(cells), strict=True)
-            return net.any(differ(moment.after, cell, moment.before, other) for cell, other in pairs)
+            return net.any(differ(transition.after, cell, transition.before, other) for cell, other in pairs)
 
-        moment.only_moves = not self._can_break(
-            moment, lambda a, b: differ(moment.before, a, moment.before, b), breaks, ()
+        transition.only_moves = not self._can_break(
+            transition, lambda a, b: differ(transition.before, a, transition.before, b), breaks, ()
         )
-        return moment.only_moves
+        return transition.only_moves
 
-    def _matched(self, moment: Moment, ids: frozenset[int], trend: str, given: Sequence[Law]) -> bool:
+    def _matched(self, transition: Transition, ids: frozenset[int], trend: str, given: Laws) -> bool:
         """Return whether the number of cells with some elements follows a trend in a substep."""
-        net, row = moment.symbols.net, moment.symbols.layouts["element"]
+        net, row = transition.symbols.net, transition.symbols.layouts["element"]
 
         def counted(world: World, cell: Cell) -> Literal:
             return net.member(row.bits(world, *cell), ids)
@@ -356,7 +359,7 @@ class Prover:
         def breaks(cells: Sequence[Cell]) -> Literal:
             """Return whether the number of counted cells, of one or two, changes against the trend."""
             sums = []
-            for world in (moment.before, moment.after):
+            for world in (transition.before, transition.after):
                 flags = [counted(world, cell) for cell in cells]
                 sums.append((net.any(flags), net.all(flags)) if len(flags) > 1 else (flags[0], FALSE))
             more, fewer = (
@@ -365,26 +368,26 @@ class Prover:
             return {"constant": net.or_(more, fewer), "never rises": more, "never falls": fewer}[trend]
 
         def differ(cell: Cell, other: Cell) -> Literal:
-            return net.xor(counted(moment.before, cell), counted(moment.before, other))
+            return net.xor(counted(transition.before, cell), counted(transition.before, other))
 
-        return not self._can_break(moment, differ, breaks, given)
+        return not self._can_break(transition, differ, breaks, given)
 
     def _can_break(
         self,
-        moment: Moment,
+        transition: Transition,
         differ: Callable[[Cell, Cell], Literal],
         breaks: Callable[[Sequence[Cell]], Literal],
-        given: Sequence[Law],
+        given: Laws,
     ) -> bool:
         """Return whether a sum over all cells may change in a forbidden way, as far as matching cells can show.
 
         Moves match different cells in pairs; other cells stay single. If no cell belongs to two pairs, and no pair and no
         single cell breaks the rule, the sum does not break it.
         """
-        net = moment.symbols.net
-        assert moment.evaluation is not None
-        value, matched, broken = moment.evaluation.value, list[Literal](), list[Literal]()
-        for node, (dy, dx) in moment.moves:
+        net = transition.symbols.net
+        assert transition.evaluation is not None
+        value, matched, broken = transition.evaluation.value, list[Literal](), list[Literal]()
+        for node, (dy, dx) in transition.moves:
             forth = net.and_(value(node, *HERE), differ(HERE, (dy, dx)))
             back = net.and_(value(node, -dy, -dx), differ((-dy, -dx), HERE))
             broken.append(net.and_(forth, breaks([HERE, (dy, dx)])))
@@ -392,7 +395,7 @@ class Prover:
             broken.append(net.and_(forth, back))
             matched += [forth, back]
         broken.append(net.and_(net.any(matched) ^ 1, breaks([HERE])))
-        return moment.can_be([net.any(broken)], given)
+        return transition.can_be([net.any(broken)], given)
 
     def _reach(self) -> int:
         """Return the distance, in rows or columns, of the cells on which a cell depends after a step."""
@@ -412,7 +415,7 @@ class Prover:
             total += max((max(far[node]) for _, node in pass_.outputs), default=0)
         return total
 
-    def _symmetric(self, number: int, turn: str) -> Moment | None:
+    def _symmetric(self, number: int, turn: str) -> Transition | None:
         """Return None if a pass gives the turned world for a turned world and turned draws."""
         if any(slot.resets and slot.kind.name in ("direction", "vec2") for slot in slots(self.ruleset)):
             raise Undecided("directions that are reset are not rotated")
@@ -427,8 +430,8 @@ class Prover:
         first = [of_turned.bit(plane, *HERE) for plane, _ in pass_.outputs]
         symbols.turn = None
         second = [plain.bit(plane, *HERE) for plane, _ in pass_.outputs]
-        moment = Moment(pass_.name, symbols, (before,), before, plain, self.ranges[number])
-        return moment if moment.can_be([net.any(map(net.xor, first, second))]) else None
+        transition = Transition(pass_.name, symbols, (before,), before, plain, self.ranges[number])
+        return transition if transition.can_be([net.any(map(net.xor, first, second))]) else None
 
 
 def _reads_clock(pass_: PassGraph) -> bool:

@@ -1,4 +1,4 @@
-"""Verdicts on claims: proven, possibly broken in a moment of a step, or undecided."""
+"""Verdicts on claims: proven, possibly broken in a transition of a step, or undecided."""
 
 from __future__ import annotations
 
@@ -54,11 +54,11 @@ def judgments(
 
 def _judgment(prover: Prover, claim: Claim, without: frozenset[int]) -> Judgment:
     try:
-        moment = prover.broken(claim, without)
+        transition = prover.broken(claim, without)
     except OutOfWork:
         return Judgment(False, "a proof takes too long: `--prove SECONDS` allows more")
     except Undecided as error:
         return Judgment(False, f"no proof is known: {error}")
-    if moment is None:
+    if transition is None:
         return Judgment(True, "each pass keeps it")
-    return Judgment(False, f"pass `{moment.name}` may break it", moment.model)
+    return Judgment(False, f"pass `{transition.name}` may break it", transition.model)

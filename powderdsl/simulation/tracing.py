@@ -31,11 +31,11 @@ from powderdsl.model.types import (
     Field,
     Kind,
     Let,
-    Moment,
     Move,
     Offset,
     Rule,
     Ruleset,
+    Substep,
     Swap,
     Transform,
     integer,
@@ -60,14 +60,14 @@ _WITHOUT_RULE = {
 class NumberedRule:
     """A rule of the checked model. With loops and symmetries, one line of a file makes several rules.
 
-    `number` counts rules from 1 in the order in which they run; `moment` counts the pass's substeps from 1; `label` has
+    `number` counts rules from 1 in the order in which they run; `substep` counts the pass's substeps from 1; `label` has
     the loop variables, such as ``side = left``.
     """
 
     number: int
     pack: str
     pass_name: str
-    moment: int
+    substep: int
     label: str
     rule: Rule
 
@@ -86,9 +86,9 @@ def numbered_rules(ruleset: Ruleset) -> tuple[NumberedRule, ...]:
     """All rules in the order in which they run; rule number n is at index n − 1."""
     rules: list[NumberedRule] = []
     for pass_ in ruleset.passes:
-        for position, moment in enumerate(pass_.moments, 1):
-            where = pass_.pack, pass_.name, position, moment.label
-            rules += [NumberedRule(i, *where, rule) for i, rule in enumerate(moment.rules, len(rules) + 1)]
+        for position, substep in enumerate(pass_.substeps, 1):
+            where = pass_.pack, pass_.name, position, substep.label
+            rules += [NumberedRule(i, *where, rule) for i, rule in enumerate(substep.rules, len(rules) + 1)]
     return tuple(rules)
 
 
@@ -96,7 +96,7 @@ def numbered_rules(ruleset: Ruleset) -> tuple[NumberedRule, ...]:
 
 
 @dataclass(frozen=True, eq=False)
-class Substep:
+class RecordedSubstep:
     """A recorded substep: the state before it, and its rules. Arrays have a batch of one.
 
     `rules`, and `masks` of the cells where they fired, are keyed by `id`; `lets` maps each `let` so far to the substep
@@ -107,7 +107,7 @@ class Substep:
     rules: Mapping[int, NumberedRule]
     masks: Mapping[int, Array]
     at: reference.Context
-    lets: dict[str, tuple[Let, Substep]]
+    lets: dict[str, tuple[Let, RecordedSubstep]]
 
     def neighbor_of(self, cell: Cell, offset: Offset, way: int = 1) -> Cell:
         """The neighbor of a cell or, with -1, the cell whose neighbor it is; the grid wraps around."""
@@ -124,7 +124,7 @@ class Attempt:
     """A rule of a substep, and the cell in which its condition was evaluated."""
 
     rule: NumberedRule
-    substep: Substep
+    substep: RecordedSubstep
     cell: Cell
 
     @property
@@ -187,19 +187,19 @@ class RecordedStep:
         ruleset, to_numpy = world.sim.ruleset, world.sim.kind.to_numpy
         state = {name: to_numpy(value) for name, value in world.state.items()}
         clock = reference.Clock(*(to_numpy(part) for part in (world.seed, world.index, world.step)))
-        self.cell, self.substeps, self.writes = cell, list[Substep](), list[Write]()
+        self.cell, self.substeps, self.writes = cell, list[RecordedSubstep](), list[Write]()
         self._rules = iter(numbered_rules(ruleset))
         self.begin = reference.widen(ruleset, state)
         params = reference.parameters(ruleset, 1, {})
         self.end = reference.widen(ruleset, reference.step(ruleset, state, clock, params, watch=self))
 
-    def begins(self, moment: Moment, at: reference.Context, masks: Mapping[int, Array]) -> None:
+    def begins(self, substep: Substep, at: reference.Context, masks: Mapping[int, Array]) -> None:
         """Record a substep: see `reference.Watch`."""
-        rules = {id(numbered.rule): numbered for numbered in islice(self._rules, len(moment.rules))}
+        rules = {id(numbered.rule): numbered for numbered in islice(self._rules, len(substep.rules))}
         lets = dict(self.substeps[-1].lets) if self.substeps else {}
-        substep = Substep(moment.policy, rules, masks, replace(at, lets=dict(at.lets)), lets)
-        lets.update({let.name: (let, substep) for let in moment.lets})
-        self.substeps.append(substep)
+        recorded = RecordedSubstep(substep.policy, rules, masks, replace(at, lets=dict(at.lets)), lets)
+        lets.update({let.name: (let, recorded) for let in substep.lets})
+        self.substeps.append(recorded)
 
     def wrote(self, change: reference.Change, before: Array, after: Array, mask: Array | None = None) -> None:
         """Record a write to the cell, if it has a rule or changes something."""
@@ -249,7 +249,7 @@ class Part:
     """
 
     expr: Expr
-    substep: Substep
+    substep: RecordedSubstep
     cell: Cell
     let: str | None = None
 
@@ -284,7 +284,7 @@ def _split(part: Part) -> Iterator[Part]:
         yield part
 
 
-def _reads(expr: Expr, substep: Substep, cell: Cell, offset: Offset) -> Iterator[Read]:
+def _reads(expr: Expr, substep: RecordedSubstep, cell: Cell, offset: Offset) -> Iterator[Read]:
     """The values that an expression reads when it is evaluated `offset` away from the cell."""
     if expr.op == "look":
         dy, dx = expr.value
@@ -299,7 +299,7 @@ def _reads(expr: Expr, substep: Substep, cell: Cell, offset: Offset) -> Iterator
             yield from _reads(let.value, fixed, cell, offset)
 
 
-def _read(expr: Expr, substep: Substep, place: Cell, offset: Offset) -> Read:
+def _read(expr: Expr, substep: RecordedSubstep, place: Cell, offset: Offset) -> Read:
     ruleset, state, value = substep.at.ruleset, substep.at.state, substep.value(expr, place)
     away, element, counted = offset != HERE, None, []
     if expr.op == "property" or (away and expr.op in ("field", "let")):
@@ -547,7 +547,7 @@ def _source(trace: Trace, attempt: Attempt, labels: list[Label]) -> list[str]:
     rule = attempt.rule
     label = f" ({rule.label})" if rule.label else ""
     where = f", asked at {_at(attempt.cell)}" if attempt.cell != trace.cell else ""
-    notes = [f"pass {rule.pass_name} of {rule.pack}, substep {rule.moment}{label}{where}"]
+    notes = [f"pass {rule.pass_name} of {rule.pack}, substep {rule.substep}{label}{where}"]
     for part in attempt.held:
         values, span = _reads_text(part), part.expr.span
         come = f" (`{part.let}`, {place_of(span)})" if part.let and span else ""
@@ -625,7 +625,7 @@ def _data(value: Any) -> Any:
         case tuple():
             return [_data(item) for item in value]
         case NumberedRule():
-            numbered = _attributes(value, "number", "pack", "moment", "label")
+            numbered = _attributes(value, "number", "pack", "substep", "label")
             return numbered | {"pass": value.pass_name, "text": one_line(value.span), **_place(value.span)}
         case Part():
             return _attributes(value, "text", "holds", "let", "reads") | _place(value.expr.span)
@@ -692,21 +692,21 @@ def _with_rule_marks(ruleset: Ruleset) -> Ruleset:
     """The rules with a field for the number of the rule that last wrote a cell's element in this step."""
     numbers, passes = count(1), []
     for pass_ in ruleset.passes:
-        moments = []
-        for moment in pass_.moments:
-            rules, late = list(moment.rules), list[tuple[bool, Assign]]()
-            for place, rule in enumerate(moment.rules):
+        substeps = []
+        for substep in pass_.substeps:
+            rules, late = list(substep.rules), list[tuple[bool, Assign]]()
+            for place, rule in enumerate(substep.rules):
                 number, writes = next(numbers), _element_writes(rule)
                 mark = Expr("const", integer(number, number), value=number)
-                if moment.policy in ("prove", "overwrite"):  # all rules fire where their conditions hold
+                if substep.policy in ("prove", "overwrite"):  # all rules fire where their conditions hold
                     for arrives, at in writes:
                         late.append((arrives, Assign(SLOT, at, ":=", mark, rule.mask, rule.span)))
                 elif not isinstance(rule, Assign):  # each claimed cell has one writer
                     marks = (Assign(SLOT, at, ":=", mark, TRUE, rule.span) for _, at in writes)
                     rules[place] = replace(rule, effects=(*rule.effects, *marks))
             rules += [mark for _, mark in sorted(late, key=lambda mark: mark[0])]
-            moments.append(replace(moment, rules=tuple(rules)))
-        passes.append(replace(pass_, moments=tuple(moments)))
+            substeps.append(replace(substep, rules=tuple(rules)))
+        passes.append(replace(pass_, substeps=tuple(substeps)))
     kind = integer(0, max(1, next(numbers) - 1))
     slot = Field(SLOT, kind, 0, "place", True, None, ruleset.elements[0].pack, ruleset.elements[0].span)
     return replace(ruleset, fields=(*ruleset.fields, slot), passes=tuple(passes))

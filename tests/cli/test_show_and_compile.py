@@ -39,7 +39,7 @@ def test_show_lists_elements_reactions_passes_and_parameters():
     melting = next(line for line in lines if line.split()[:3] == ["ice", "water", "melt"])
     assert "ice -> water if count(thaws) > 1 and interact < melt" in melting
     assert "rules/water.yaml:" in melting
-    assert sum("moments" in line for line in lines) == 1
+    assert sum("substeps" in line for line in lines) == 1
     assert any(line.split()[:3] == ["water.melt", "2%", "chance"] for line in lines)
     assert any(line.split()[:2] == ["fire.spread", "12.5%"] for line in lines)
     few = powderdsl("show", "core").stdout.splitlines()
@@ -60,7 +60,7 @@ def test_show_as_json(name):
     data, rules = json.loads(powderdsl("show", name, "--json", exits=0).stdout), package.load(name)
     assert [row["name"] for row in data["elements"]] == [element.name for element in rules.elements]
     assert [row["name"] for row in data["passes"]] == [one.name for one in rules.passes]
-    assert [row["moments"] for row in data["passes"]] == [len(one.moments) for one in rules.passes]
+    assert [row["substeps"] for row in data["passes"]] == [len(one.substeps) for one in rules.passes]
     assert {row["name"]: row["value"] for row in data["params"]} == {
         param.name: float(param.default) for param in rules.params
     }
@@ -113,7 +113,7 @@ def test_every_model_has_a_text(name):
     assert text.endswith("\n")
     assert not text.endswith("\n\n")
     assert all(f"\npass {one.name} of {one.pack}  # " in text for one in rules.passes)
-    count = sum(len(moment.rules) for one in rules.passes for moment in one.moments)
+    count = sum(len(substep.rules) for one in rules.passes for substep in one.substeps)
     lines = [
         line for line in text.splitlines() if line.startswith("    ") and not line.startswith("    let ")
     ]

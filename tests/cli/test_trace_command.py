@@ -40,7 +40,7 @@ def test_json_has_a_stable_form():
     assert (data["schema"], data["cell"], data["step"]) == (1, [1, 1], 1)
     element = data["slots"]["element"]
     assert (element["before"], element["after"]) == ("empty", "sand")
-    keys = "number pack pass moment label text file line column"
+    keys = "number pack pass substep label text file line column"
     assert set(element["writer"]) == set(keys.split())
     write = next(one for one in data["writes"] if one["slot"] == "element")
     assert set(write) == {"slot", "before", "after", "how", "rule", "cell", "source", "parts"}

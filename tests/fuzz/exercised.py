@@ -70,7 +70,7 @@ def operations(ruleset: Ruleset) -> Used:
 
 
 def program_nodes(program: Program) -> Iterator[Node]:
-    """Every node of a program, guards of moments included."""
+    """Every node of a program, guards of substeps included."""
     for pass_ in program.passes:
         yield from nodes_of(pass_)
 
@@ -97,9 +97,9 @@ def constructs(ruleset: Ruleset) -> Iterator[tuple[str, str]]:
     for expr in expressions(ruleset):
         yield "model", expr.op
         yield "model", f"{expr.op} {expr.kind.name}"
-    for moment in (moment for pass_ in ruleset.passes for moment in pass_.moments):
-        yield "rules", moment.policy
-        for rule in moment.rules:
+    for substep in (substep for pass_ in ruleset.passes for substep in pass_.substeps):
+        yield "rules", substep.policy
+        for rule in substep.rules:
             yield "rules", type(rule).__name__
             for update in (rule,) if isinstance(rule, Assign) else rule.effects:
                 yield "rules", update.op
@@ -108,9 +108,9 @@ def constructs(ruleset: Ruleset) -> Iterator[tuple[str, str]]:
 def expressions(ruleset: Ruleset) -> Iterator[Expr]:
     """Every expression of a ruleset and every part of it."""
     for pass_ in ruleset.passes:
-        for moment in pass_.moments:
-            tops = [let.value for let in moment.lets]
-            for rule in moment.rules:
+        for substep in pass_.substeps:
+            tops = [let.value for let in substep.lets]
+            for rule in substep.rules:
                 updates = (rule,) if isinstance(rule, Assign) else rule.effects
                 parts = (rule.mask, getattr(rule, "target", None), getattr(rule, "leaving", None))
                 tops += [part for part in (*parts, *(update.value for update in updates)) if part is not None]

@@ -41,12 +41,18 @@ def test_counted_by_hand() -> None:
     found = by_name(PACK)
     fade, fall, warm = (found[name] for name in ("fade", "fall", "warm"))
     # dust and above and below a quarter: they change, which leaves dust and not that
-    assert (fade.moments, fade.shifts, fade.moves, fade.random_bits, fade.reals) == (1, 1, 0, 2, 0)
+    assert (fade.substeps, fade.shifts, fade.moves, fade.random_bits, fade.float_operations) == (
+        1,
+        1,
+        0,
+        2,
+        0,
+    )
     assert 3 <= fade.gates <= 5
     # dust, and below is none
     assert (fall.gates, fall.shifts, fall.moves, fall.neighbors) == (2, 1, 1, 1)
     # the product, the choice, the bounds
-    assert (warm.gates, warm.shifts, warm.reals, warm.neighbors) == (0, 0, 3, 0)
+    assert (warm.gates, warm.shifts, warm.float_operations, warm.neighbors) == (0, 0, 3, 0)
     assert sum(one.share for one in found.values()) == pytest.approx(1)
     assert {one.form for one in found.values()} == {"planes"}
 

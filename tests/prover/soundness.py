@@ -102,9 +102,9 @@ def _conditions(ruleset: Ruleset) -> Iterator[Expr]:
     """The parts of conditions of rules that a claim may name, and their parts."""
     named = {slot.name for slot in slots(ruleset)}
     for pass_ in ruleset.passes:
-        for moment in pass_.moments:
+        for substep in pass_.substeps:
             written = [
-                expr for rule in moment.rules for expr in (rule.mask, *(w.mask for w in writes_of(rule)))
+                expr for rule in substep.rules for expr in (rule.mask, *(w.mask for w in writes_of(rule)))
             ]
             for expr in (part for whole in written for part in whole.walk()):
                 parts = list(expr.walk())

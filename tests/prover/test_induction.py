@@ -34,8 +34,8 @@ def verdicts(ruleset: Ruleset) -> dict[str, str]:
         prover = Prover(ruleset, Budget.of(60))
         assert prover.well_formed() is None
         for invariant in ruleset.invariants:
-            moment = prover.broken(invariant.claim, invariant.without)
-            broken[one_line(invariant.span)] = moment.name if moment else ""
+            transition = prover.broken(invariant.claim, invariant.without)
+            broken[one_line(invariant.span)] = transition.name if transition else ""
     return broken
 
 
@@ -130,10 +130,10 @@ invariants:
 )
 def test_what_changes_from_step_to_step_is_not_taken_for_the_same(claim: str, is_proven: bool) -> None:
     try:
-        (moment,) = verdicts(load_text(f"{CLOCK}  - {claim}\n")).values()
+        (transition,) = verdicts(load_text(f"{CLOCK}  - {claim}\n")).values()
     except Undecided:
-        moment = "undecided"
-    assert (moment == "") == is_proven
+        transition = "undecided"
+    assert (transition == "") == is_proven
 
 
 GUST = """

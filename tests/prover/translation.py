@@ -71,6 +71,6 @@ def _verdict(ruleset: Ruleset, first: Program, second: Program, number: int, sec
         return f"{type(error).__name__}: {error}"
     if difference is None:
         return "equal"
-    moment = difference.moment
+    transition = difference.transition
     # Arithmetic of floats is not known to the prover: what differs may be two ways to write one number.
-    return "floats" if moment.questions.same or moment.symbols.comparisons else "differs"
+    return "floats" if transition.questions.same or transition.symbols.comparisons else "differs"

@@ -207,7 +207,7 @@ def test_names_after_a_dot_may_be_absent() -> None:
     ]
     rules, notes = load_with_diagnostics("core", "one.yaml", mine)
     buzz = next(one for one in rules.passes if one.name == "buzz")
-    assert [len(moment.rules) for moment in buzz.moments] == [1, 1]
+    assert [len(substep.rules) for substep in buzz.substeps] == [1, 1]
 
 
 NAMESAKE = """

@@ -20,7 +20,7 @@ from powderdsl.model import reference
 from powderdsl.model.check import check
 from powderdsl.model.declarations import PackDecl, read_file
 from powderdsl.model.state import SNAP, slots
-from powderdsl.model.types import Assign, Moment, Move, Swap, Transform
+from powderdsl.model.types import Assign, Move, Substep, Swap, Transform
 from powderdsl.simulation.simulator import Simulator, World
 from powderdsl.simulation.simulator import compile as compile_ruleset
 from powderdsl.testing.generators.cases import Choices, random_start
@@ -181,29 +181,29 @@ def test_every_value_is_one_that_was_declared() -> None:
 def test_what_is_shown_to_be_impossible_never_happens(monkeypatch: pytest.MonkeyPatch) -> None:
     """Substeps without a policy have no conflicts, and rules that "can never fire" (PD503) never fire."""
     silent: set[Span] = set()
-    counts = {"claims": 0, "moments": 0, "silent": 0}
-    run_moment = reference.run_moment
+    counts = {"claims": 0, "substeps": 0, "silent": 0}
+    run_substep = reference.run_substep
 
-    def watched(moment: Moment, at: reference.Context, table: Any) -> reference.State:
+    def watched(substep: Substep, at: reference.Context, table: Any) -> reference.State:
         lets = dict(at.lets)
-        for let in moment.lets:
+        for let in substep.lets:
             at.lets[let.name] = reference.evaluate(let.value, at)
-        masks = [(rule, reference.evaluate(rule.mask, at)) for rule in moment.rules]
+        masks = [(rule, reference.evaluate(rule.mask, at)) for rule in substep.rules]
         for rule, mask in masks:
             if rule.span in silent:
                 counts["silent"] += 1
                 assert not mask.any(), f"this rule fires: {rule.span.text}"
-        if moment.policy == "prove":
-            counts["moments"] += 1
+        if substep.policy == "prove":
+            counts["substeps"] += 1
             for claimed in (_sources(masks), _targets(masks)):
                 for cells in claimed:
                     counts["claims"] += int(cells.sum())
                     assert cells.max(initial=0) <= 1, [rule.span.text for rule, _ in masks]
         at.lets.clear()
         at.lets.update(lets)
-        return run_moment(moment, at, table)
+        return run_substep(substep, at, table)
 
-    monkeypatch.setattr(reference, "run_moment", watched)
+    monkeypatch.setattr(reference, "run_substep", watched)
     for seed in range(300, 330):
         reporter = Reporter()
         pack = read_file(Source(f"seed{seed}.yaml", random_ruleset_text(seed)), reporter)
@@ -217,7 +217,7 @@ def test_what_is_shown_to_be_impossible_never_happens(monkeypatch: pytest.Monkey
         simulator = compile_ruleset(ruleset, backend="reference")
         for part, shape in enumerate(((3, 4, 6), (2, 1, 3))):
             simulator.step(random_world(simulator, seed * 2 + part, shape), 2)
-    assert counts["moments"] > 70
+    assert counts["substeps"] > 70
     assert counts["claims"] > 700
     assert counts["silent"] > 4
 

@@ -205,7 +205,7 @@ def _ledger(ruleset: Ruleset) -> Ledger:
 
 def _cost_lines(passes: tuple[PassCost, ...]) -> Iterator[str]:
     """A table, a line for each pass that does not run on bit planes, and an explanation of the numbers."""
-    numbers = ("moments", "gates", "shifts", "moves", "random bits", "reals", "neighbors")
+    numbers = ("substeps", "gates", "shifts", "moves", "random bits", "float operations", "neighbors")
     rows = [["pass", "form", "share (%)", *numbers]]
     for cost in passes:
         values = (str(getattr(cost, name.replace(" ", "_"))) for name in numbers)

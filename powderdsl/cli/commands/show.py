@@ -160,7 +160,7 @@ def _of_rules(ruleset: Ruleset) -> tuple[dict[str, Any], Tables]:
     passes = [
         {
             **_described(pass_, "name", "pack"),
-            "moments": len(pass_.moments),
+            "substeps": len(pass_.substeps),
             "rules": _rules(pass_),
             "where": place_of(pass_.span),
         }
@@ -202,7 +202,7 @@ def _elements(ruleset: Ruleset, ids: Iterable[int]) -> Shown:
 
 def _rules(pass_: Pass) -> Shown:
     """The number of a pass's rules, and their distinct lines: loops and symmetries make many rules of one."""
-    spans = dict.fromkeys(rule.span for moment in pass_.moments for rule in moment.rules)
+    spans = dict.fromkeys(rule.span for substep in pass_.substeps for rule in substep.rules)
     return Shown(str(len(spans)), [{"rule": one_line(span), "where": place_of(span)} for span in spans])
 
 

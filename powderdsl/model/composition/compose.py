@@ -540,8 +540,8 @@ def _blocks(composition: Composition, passes: tuple[Pass, ...]) -> list[list[str
     place = composition.group
     blocks: list[list[str]] = [[] for _ in range(max(place.values()) + 1)]
     first: dict[str, int] = {}
-    for pass_, moment in substeps(passes):
-        for rule in moment.rules:
+    for pass_, substep in substeps(passes):
+        for rule in substep.rules:
             for write in writes_of(rule):
                 first[write.field] = min(place[pass_.pack], first.get(write.field, place[pass_.pack]))
     for name, prop in composition.properties.items():

@@ -40,11 +40,11 @@ from powderdsl.model.types import (
     HERE,
     Assign,
     Expr,
-    Moment,
     Move,
     Offset,
     Pass,
     Rule,
+    Substep,
     Swap,
     Transform,
     footprint,
@@ -149,11 +149,11 @@ def check_logic(
     limited = replace(facts, budget=Budget(COMPARISONS))
     for at, pass_ in enumerate(passes):
         earlier: Lets = {}
-        for number, moment in enumerate(pass_.moments):
-            lets = earlier | moment.values
+        for number, substep in enumerate(pass_.substeps):
+            lets = earlier | substep.values
             earlier = flags_for_later(lets)
             live = []
-            for rule in moment.rules:
+            for rule in substep.rules:
                 happens = decide(facts, [(rule.mask, HERE)], lets)
                 fires.add(rule.span, happens)
                 changes = happens
@@ -165,7 +165,7 @@ def check_logic(
                     silent.setdefault(rule.span, []).append((rule.mask, lets))
                 else:
                     live.append(rule)
-            if moment.policy == "prove":
+            if substep.policy == "prove":
                 lists.append((len(live), pass_))
                 for conflict, elements in _check_substep(live, limited, lets):
                     conflicts.setdefault(conflict, (elements, []))[1].append((at, number))
@@ -249,34 +249,34 @@ def _report_conflicts(
     resolved: set[tuple[int, int]] = set()
     for conflict, (elements, places) in conflicts.items():
         words = _example_text(facts, elements)
-        pass_, moments = passes[places[0][0]], [passes[at].moments[number] for at, number in places]
+        pass_, substeps = passes[places[0][0]], [passes[at].substeps[number] for at, number in places]
         causes = (
             added.causes(pass_.pack, conflict.second, list(elements.values()) or facts.ids) if added else ()
         )
         if not causes:
-            conflict.report([moment.label for moment in moments], words, reporter)
+            conflict.report([substep.label for substep in substeps], words, reporter)
             continue
-        settled = conflict.assigns or all(map(_allows_first_wins, moments))
+        settled = conflict.assigns or all(map(_allows_first_wins, substeps))
         if settled and not conflict.assigns:
             resolved.update(places)
         conflict.report_added(causes, pass_.name, words, settled, reporter)
-    changed = [list(pass_.moments) for pass_ in passes]
+    changed = [list(pass_.substeps) for pass_ in passes]
     for at, number in sorted(resolved):
         changed[at][number] = replace(changed[at][number], policy="first_wins")
     pairs = zip(passes, changed, strict=True)
-    return tuple([replace(pass_, moments=tuple(moments)) for pass_, moments in pairs])
+    return tuple([replace(pass_, substeps=tuple(substeps)) for pass_, substeps in pairs])
 
 
-def _allows_first_wins(moment: Moment) -> bool:
+def _allows_first_wins(substep: Substep) -> bool:
     """True if `first_wins` changes nothing where no two rules conflict.
 
     Without the policy, moves may go where another one leaves, and transforms into one element may all have their
     effects.
     """
-    transforms = [rule for rule in moment.rules if isinstance(rule, Transform)]
+    transforms = [rule for rule in substep.rules if isinstance(rule, Transform)]
     targets = [rule.target for rule in transforms]
     return all(targets.count(rule.target) == 1 for rule in transforms if rule.effects) and not any(
-        isinstance(rule, Move) for rule in moment.rules
+        isinstance(rule, Move) for rule in substep.rules
     )
 
 

@@ -27,12 +27,12 @@ from powderdsl.model.types import (
     Assign,
     Expr,
     Field,
-    Moment,
     Move,
     Offset,
     Pass,
     Rule,
     Ruleset,
+    Substep,
     Transform,
     alike,
     plus,
@@ -84,8 +84,8 @@ def _inside_any(span: Span, others: Sequence[Span]) -> bool:
 def _report_decided(passes: tuple[Pass, ...], silent: Sequence[Span], reporter: Reporter) -> None:
     """Report comparisons of integers whose ranges alone decide them."""
     outcomes: dict[Span, set[Bounds | None]] = {}
-    for _, moment in substeps(passes):
-        for part in (*moment.values.values(), *_parts(moment.rules)):
+    for _, substep in substeps(passes):
+        for part in (*substep.values.values(), *_parts(substep.rules)):
             for node in part.walk():
                 if node.op in COMPARISONS.values() and node.span is not None:
                     left, right = node.args
@@ -130,11 +130,11 @@ def _report_overruled(
 ) -> list[Span]:
     matters: Answers[Span] = Answers()
     winners: dict[Span, Rule] = {}
-    for _, moment in substeps(passes):
-        for place, rule in enumerate(moment.rules):
+    for _, substep in substeps(passes):
+        for place, rule in enumerate(substep.rules):
             if not matters.get(rule.span):
-                rivals = _rivals(rule, place, moment)
-                matters.add(rule.span, _may_matter(rule, rivals, moment, facts))
+                rivals = _rivals(rule, place, substep)
+                matters.add(rule.span, _may_matter(rule, rivals, substep, facts))
                 if rivals:
                     winners.setdefault(rule.span, rivals[0])
     for span in matters.where(False):
@@ -149,28 +149,28 @@ def _report_overruled(
     return [span for span in matters.where(None) if not _inside_any(span, silent)]
 
 
-def _may_matter(rule: Rule, rivals: Sequence[Rule], moment: Moment, facts: Facts) -> bool | None:
+def _may_matter(rule: Rule, rivals: Sequence[Rule], substep: Substep, facts: Facts) -> bool | None:
     """False if the rivals of a rule always overrule it; None if deciding takes too much work."""
-    facts.budget.left -= len(moment.rules) // GLANCES
+    facts.budget.left -= len(substep.rules) // GLANCES
     if facts.budget.left < 0:
         return None
     here = rule.mask, HERE
-    if not rivals or decide(facts, [here], moment.values) is False:
+    if not rivals or decide(facts, [here], substep.values) is False:
         return True
-    return decide(facts, [here, *((negation(other.mask), HERE) for other in rivals)], moment.values)
+    return decide(facts, [here, *((negation(other.mask), HERE) for other in rivals)], substep.values)
 
 
-def _rivals(rule: Rule, place: int, moment: Moment) -> list[Rule]:
+def _rivals(rule: Rule, place: int, substep: Substep) -> list[Rule]:
     """The rules of a substep that overrule a rule wherever they fire."""
     rivals: list[Rule] = []
-    for number, other in enumerate(moment.rules):
+    for number, other in enumerate(substep.rules):
         earlier = number < place
         match rule, other:
             case Assign(), Assign(op=":="):
                 wins = not earlier and (other.field, other.offset) == (rule.field, rule.offset)
             case Transform(), Transform():
-                settled = alike(rule, other) or moment.policy == "first_wins"
-                wins = moment.policy == "drop_both" or (earlier and settled)
+                settled = alike(rule, other) or substep.policy == "first_wins"
+                wins = substep.policy == "drop_both" or (earlier and settled)
             case _:
                 wins = False
         if wins and other.span != rule.span:
@@ -210,12 +210,12 @@ def report_undrawn(
 def _may_draw(name: str, number: int, ruleset: Ruleset, facts: Facts) -> Iterator[bool | None]:
     """For each rule that reads the property, whether it can fire where this element is."""
     for pass_ in ruleset.passes:
-        everywhere = {let.name: let.value for moment in pass_.moments for let in moment.lets}
-        for moment in pass_.moments:
-            for rule in moment.rules:
-                for at in _reads(name, _parts([rule]), moment.values, everywhere):
+        everywhere = {let.name: let.value for substep in pass_.substeps for let in substep.lets}
+        for substep in pass_.substeps:
+            for rule in substep.rules:
+                for at in _reads(name, _parts([rule]), substep.values, everywhere):
                     here = [(member(ELEMENT_HERE, (number,)), at)] if at is not None else []
-                    yield not here or decide(facts, [(rule.mask, HERE), *here], moment.values)
+                    yield not here or decide(facts, [(rule.mask, HERE), *here], substep.values)
 
 
 def _reads(name: str, parts: Iterable[Expr], lets: Lets, everywhere: Lets) -> dict[Offset | None, None]:
@@ -250,12 +250,12 @@ def _report_lost_writes(
 ) -> list[Span]:
     """Warn of assignments and effects that are lost wherever their rule happens, in all its copies."""
     arrives: Answers[tuple[Span, str]] = Answers()
-    for _, moment in substeps(passes):
-        for rule in moment.rules:
+    for _, substep in substeps(passes):
+        for rule in substep.rules:
             for write in writes_of(rule):
                 key, field = (write.span, write.field), fields.get(write.field)
                 if field and field.of is not None and rule.span not in silent and not arrives.get(key):
-                    arrives.add(key, _may_land(write, rule, tuple(sorted(field.of)), moment, facts))
+                    arrives.add(key, _may_land(write, rule, tuple(sorted(field.of)), substep, facts))
     for span, name in arrives.where(False):
         reporter.report(
             "PD516", f"this write to `{name}` is always lost", span, f"no target cell has a `{name}`",
@@ -265,7 +265,7 @@ def _report_lost_writes(
     return [span for span, _ in arrives.where(None)]
 
 
-def _may_land(write: Assign, rule: Rule, ids: tuple[int, ...], moment: Moment, facts: Facts) -> bool | None:
+def _may_land(write: Assign, rule: Rule, ids: tuple[int, ...], substep: Substep, facts: Facts) -> bool | None:
     """True if the cell may hold one of these elements when the write lands; None if deciding takes too much work.
 
     Assignments come before movements, effects after them.
@@ -277,10 +277,10 @@ def _may_land(write: Assign, rule: Rule, ids: tuple[int, ...], moment: Moment, f
     elif brought is not None and not (isinstance(rule, Move) and write.offset == HERE):
         landing = [(rule.mask, brought)]
     else:  # other rules may bring an element there, also to the place that a move leaves
-        landing = [(other.mask, what) for other in moment.rules for what in _brings(other).values()]
+        landing = [(other.mask, what) for other in substep.rules for what in _brings(other).values()]
         landing += [stays] if brought is None else []
     return some(
-        decide(facts, [(mask, HERE), (member(what, ids), HERE)], moment.values) for mask, what in landing
+        decide(facts, [(mask, HERE), (member(what, ids), HERE)], substep.values) for mask, what in landing
     )
 
 
@@ -381,9 +381,9 @@ def overridden_ids(passes: tuple[Pass, ...], names: Sequence[str], facts: Facts)
     A cell's own value may meet the condition of another such rule, so this repeats until nothing is added.
     """
     writes: list[tuple[Assign, Lets]] = []
-    for _, moment in substeps(passes):
-        for rule in moment.rules:
-            writes += [(write, moment.values) for write in writes_of(rule) if write.field in names]
+    for _, substep in substeps(passes):
+        for rule in substep.rules:
+            writes += [(write, substep.values) for write in writes_of(rule) if write.field in names]
     ids_of: dict[str, frozenset[int]] = {}
     more: dict[str, frozenset[int]] = {name: frozenset() for name in names}
     while more != ids_of:
@@ -401,8 +401,8 @@ def overridden_ids(passes: tuple[Pass, ...], names: Sequence[str], facts: Facts)
 def without_dead_overrides(passes: tuple[Pass, ...], dead: frozenset[str]) -> tuple[Pass, ...]:
     """The passes without assignments to properties that no cell can override, which are not stored."""
 
-    def alive(moment: Moment) -> Moment:
-        rules = [r for r in moment.rules if not (isinstance(r, Assign) and r.field in dead)]
-        return replace(moment, rules=tuple(rules))
+    def alive(substep: Substep) -> Substep:
+        rules = [r for r in substep.rules if not (isinstance(r, Assign) and r.field in dead)]
+        return replace(substep, rules=tuple(rules))
 
-    return tuple(replace(pass_, moments=tuple(map(alive, pass_.moments))) for pass_ in passes)
+    return tuple(replace(pass_, substeps=tuple(map(alive, pass_.substeps))) for pass_ in passes)

@@ -13,7 +13,7 @@ from powderdsl.model.composition.added_packs import Cause, Difference
 from powderdsl.model.declarations import PackDecl
 from powderdsl.model.state import slots
 from powderdsl.model.text import one_line
-from powderdsl.model.types import Moment, Pass, Ruleset
+from powderdsl.model.types import Pass, Ruleset, Substep, substeps
 from powderdsl.testing.generators.cases import Start
 from powderdsl.testing.pack_tests.runner import ExampleResult, start_of
 from powderdsl.testing.properties.breaks import Agreement, Alike, Tested, breaks, is_paired
@@ -39,14 +39,14 @@ def culprits(claim: Tested, ruleset: Ruleset, sample: Start, steps: int) -> tupl
         return ()
     *rest, pass_ = passes[: _turning(len(passes), lambda count: broken(passes[:count]))]
 
-    def cut(moments: Sequence[Moment]) -> tuple[Pass, ...]:
-        return (*rest, replace(pass_, moments=tuple(moments)))
+    def cut(substeps: Sequence[Substep]) -> tuple[Pass, ...]:
+        return (*rest, replace(pass_, substeps=tuple(substeps)))
 
-    count = _turning(len(pass_.moments), lambda count: broken(cut(pass_.moments[:count])))
-    *before, moment = pass_.moments[:count]
-    lines = tuple(dict.fromkeys(rule.span for rule in moment.rules))
-    rules = {line: tuple(rule for rule in moment.rules if rule.span != line) for line in lines}
-    alone = [line for line in lines if not broken(cut([*before, replace(moment, rules=rules[line])]))]
+    count = _turning(len(pass_.substeps), lambda count: broken(cut(pass_.substeps[:count])))
+    *before, substep = pass_.substeps[:count]
+    lines = tuple(dict.fromkeys(rule.span for rule in substep.rules))
+    rules = {line: tuple(rule for rule in substep.rules if rule.span != line) for line in lines}
+    alone = [line for line in lines if not broken(cut([*before, replace(substep, rules=rules[line])]))]
     return tuple(alone) or lines
 
 
@@ -127,9 +127,7 @@ def _lines_that_happened(ruleset: Ruleset, state: Mapping[str, Any]) -> list[Spa
 
 def _rules(ruleset: Ruleset, lines: Iterable[Span], packs: tuple[str, ...]) -> list[Cause]:
     """The lines among these that rules of some packs have."""
-    owners = {
-        rule.span: pass_.pack for pass_ in ruleset.passes for moment in pass_.moments for rule in moment.rules
-    }
+    owners = {rule.span: pass_.pack for pass_, part in substeps(ruleset.passes) for rule in part.rules}
     mine = [span for span in lines if owners.get(span) in packs]
     return [Cause(owners[span], span, one_line(span), True) for span in mine]
 

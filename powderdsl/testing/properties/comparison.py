@@ -90,7 +90,7 @@ def compare(
                 return Comparison(
                     "equal", "each pass does the same with every well-formed world", tuple(given)
                 )
-            model, numbers = difference.moment.model, difference.passes[0]
+            model, numbers = difference.transition.model, difference.passes[0]
             place = f"pass `{first.ruleset.passes[numbers[0]].name}`" if numbers else "a pass"
             reason = f"{place} may differ"
     distinction = distinguish(first, second, focus, seed, model, names) if search else None
@@ -159,7 +159,7 @@ def _matches(first: Ruleset, second: Ruleset) -> Iterator[dict[str, str]]:
 def _uses(ruleset: Ruleset) -> dict[str, tuple[int, str]]:
     """The size of draws by stream, and the conditions of the rules that use them, without their name."""
     uses = {stream.name: (stream.bits, "") for stream in ruleset.streams}
-    for rule in (rule for p in ruleset.passes for moment in p.moments for rule in moment.rules):
+    for rule in (rule for p in ruleset.passes for substep in p.substeps for rule in substep.rules):
         for name in {part.value for part in rule.mask.walk() if part.op == "draw"}:
             uses[name] = uses[name][0], uses[name][1] + repr(rule.mask).replace(repr(name), "")
     return uses

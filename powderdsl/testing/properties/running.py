@@ -14,7 +14,7 @@ from powderdsl.diagnostics import Span
 from powderdsl.model import reference
 from powderdsl.model.expressions.operators import TRUE
 from powderdsl.model.state import Slot, slots
-from powderdsl.model.types import FLAG, Assign, Field, Moment, Pass, Rule, Ruleset
+from powderdsl.model.types import FLAG, Assign, Field, Pass, Rule, Ruleset, Substep, substeps
 from powderdsl.simulation.programs import starting_backend
 from powderdsl.simulation.simulator import compile
 from powderdsl.testing.generators.cases import Array, Choices, Start, clamped_to_holders, fresh, random_start
@@ -153,9 +153,7 @@ Runs = Runner | Oracle
 
 def rule_spans(ruleset: Ruleset) -> tuple[Span, ...]:
     """The lines of rules, in the order in which they run first. Loops and symmetries make many rules of one."""
-    return tuple(
-        dict.fromkeys(rule.span for p in ruleset.passes for moment in p.moments for rule in moment.rules)
-    )
+    return tuple(dict.fromkeys(rule.span for _, part in substeps(ruleset.passes) for rule in part.rules))
 
 
 def with_line_marks(ruleset: Ruleset) -> Ruleset:
@@ -170,10 +168,10 @@ def with_line_marks(ruleset: Ruleset) -> Ruleset:
         effect = Assign(names[rule.span], (0, 0), ":=", TRUE, TRUE, rule.span)
         return (replace(rule, effects=(*rule.effects, effect)),)
 
-    def flagging(moment: Moment) -> Moment:
-        return replace(moment, rules=tuple(chain.from_iterable(map(flagged, moment.rules))))
+    def flagging(substep: Substep) -> Substep:
+        return replace(substep, rules=tuple(chain.from_iterable(map(flagged, substep.rules))))
 
-    passes = (replace(pass_, moments=tuple(map(flagging, pass_.moments))) for pass_ in ruleset.passes)
+    passes = (replace(pass_, substeps=tuple(map(flagging, pass_.substeps))) for pass_ in ruleset.passes)
     return replace(ruleset, fields=(*ruleset.fields, *flags), passes=tuple(passes))
 
 

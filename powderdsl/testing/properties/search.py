@@ -324,7 +324,7 @@ class Work:
     left: int
 
     def spend(self, batch: Start, steps: int) -> None:
-        rules = 1 + sum(len(moment.rules) for decl in self.ruleset.passes for moment in decl.moments)
+        rules = 1 + sum(len(substep.rules) for decl in self.ruleset.passes for substep in decl.substeps)
         self.left -= rules * steps * (RULE + batch.ids.size)
 
 
