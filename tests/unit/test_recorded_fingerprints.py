@@ -27,7 +27,7 @@ splits:
   test: {knobs: {many: 5}}
 """
 RECORDED = {
-    "task": "a5259c04c00ea59b",
+    "task": "8e8ff6627fde4ef4",
     "goal": "b5ca4d0c7989337c",
     "splits": "dad27f9dfce5a554",
     "agent": "e387b8aca9904ca3",
