@@ -14,7 +14,7 @@ from torch import Tensor
 
 from powderdsl.envs.compiled import CompiledEnv, Steps, tensors_of
 from powderdsl.envs.tensor_env import Info, check_going
-from powderdsl.tasks.compiled import Results, Rows, Stepper
+from powderdsl.tasks.compiled import Results, ReusedArray, Stepper
 from powderdsl.tasks.episodes import TaskProgram, load_program
 from powderdsl.tasks.mixed import MixedEpisodes, joined
 from powderdsl.tasks.task import Task
@@ -60,7 +60,7 @@ class Joint:
         self._order = order
         self._numbers = np.empty((len(members), steppers[0].play.numbers), np.int64)
         self._observed = np.zeros((len(members), *shape), dtype)
-        self._shown: list[Rows] = []
+        self._shown: list[ReusedArray] = []
         ends = np.cumsum([0, *sizes])
         memory = np.empty(int(Results.SIZE * ends[-1]), np.uint8)
         columns: list[list[Array]] = [[] for _ in COLUMNS[1:]]
@@ -77,9 +77,9 @@ class Joint:
         np.take(actions.reshape(self._numbers.shape), self._members, 0, self._numbers, mode="clip")
         for stepper in self._steppers:
             stepper.step()
-        shown = next(filter(Rows.is_free, self._shown), None)
+        shown = next(filter(ReusedArray.is_free, self._shown), None)
         if shown is None:
-            shown = Rows(self._observed.shape, self._observed.dtype)
+            shown = ReusedArray(self._observed.shape, self._observed.dtype)
             self._shown = [shown, *self._shown[:2]]
         # Other modes make another copy.
         np.take(self._observed, self._order, 0, shown.rows, mode="clip")

@@ -267,7 +267,7 @@ class Gates(Graph):
             matters, values = (matters >> (1 << i), values >> (1 << i)) if plane.attr else (matters, values)
             matters, values = matters & half, values & half
 
-        def circuit(split: Split) -> Node:
+        def circuit(split: TableSplit) -> Node:
             if split.low is None:
                 return self.flag(split is _YES)
             plane = inputs[split.input]
@@ -278,18 +278,18 @@ class Gates(Graph):
         return circuit(_best_split(matters, values, len(inputs), tuple(used)))
 
 
-class Split(NamedTuple):
+class TableSplit(NamedTuple):
     """A truth table split on an input: its values for 1 and for 0; `high` is None if they are opposite."""
 
     input: int
-    high: Split | None = None
-    low: Split | None = None
+    high: TableSplit | None = None
+    low: TableSplit | None = None
     """No gates, for a table that is the same everywhere."""
     cost: int = 0
     """The number of gates; a constant half saves one."""
 
 
-_NO, _YES = Split(-1), Split(-2)
+_NO, _YES = TableSplit(-1), TableSplit(-2)
 
 
 @cache
@@ -299,7 +299,7 @@ def _half(inputs: int, i: int) -> int:
     return ((1 << (1 << inputs)) - 1) // ((1 << 2 * step) - 1) * ((1 << step) - 1)
 
 
-def _split(matters: int, values: int, inputs: int, order: Sequence[int]) -> Split:
+def _split(matters: int, values: int, inputs: int, order: Sequence[int]) -> TableSplit:
     """Split a truth table on its inputs in order; halves that agree where both matter are joined."""
     if not matters & values or not matters & ~values:
         return _YES if matters & values else _NO
@@ -313,13 +313,13 @@ def _split(matters: int, values: int, inputs: int, order: Sequence[int]) -> Spli
         if differ:
             yeses ^= high
         joined = _split(low | high, nos | yeses & ~low, inputs, rest)
-        return Split(first, None, joined, joined.cost + 1) if differ else joined
+        return TableSplit(first, None, joined, joined.cost + 1) if differ else joined
     yes, no = _split(high, yeses, inputs, rest), _split(low, nos, inputs, rest)
-    return Split(first, yes, no, yes.cost + no.cost + (2 if yes.cost and no.cost else 1))
+    return TableSplit(first, yes, no, yes.cost + no.cost + (2 if yes.cost and no.cost else 1))
 
 
 @lru_cache(maxsize=4096)
-def _best_split(matters: int, values: int, inputs: int, used: tuple[int, ...]) -> Split:
+def _best_split(matters: int, values: int, inputs: int, used: tuple[int, ...]) -> TableSplit:
     """The split with the fewest gates, of all orders of inputs; highest first if there are too many to try."""
     orders = [used[::-1]] if len(used) > 5 else permutations(used)
     return min((_split(matters, values, inputs, order) for order in orders), key=operator.attrgetter("cost"))

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 
 from powderdsl.diagnostics import CompileError, Diagnostic, Reporter, Severity, Span, suggest
-from powderdsl.model.composition.added_packs import AddedPacks, CheckAlone, Difference, pack_words
+from powderdsl.model.composition.added_packs import AddedPacks, CheckAlone, ScopeDifference, pack_words
 from powderdsl.model.composition.compose import Composition, Palette, compose, lay_out, title, with_optional
 from powderdsl.model.composition.names import needs_of, report_misspelled, words_of
 from powderdsl.model.declarations import PackDecl, RulesetDecl
@@ -240,7 +240,7 @@ def demote_outgrown(ruleset: Ruleset, remarks: tuple[Diagnostic, ...]) -> tuple[
         alone = {(remark.code, remark.primary.span) for remark in reporter.diagnostics}
         for remark, span in own.items():
             if (remark.code, span) not in alone:
-                message = f"{Difference(added).with_packs}, {remark.message}: {place_of(span)}"
+                message = f"{ScopeDifference(added).with_packs}, {remark.message}: {place_of(span)}"
                 notes[remark] = replace(remark, code="PD515", message=message, helps=())
     return tuple(notes.get(remark, remark) for remark in remarks)
 

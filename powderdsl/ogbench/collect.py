@@ -55,7 +55,7 @@ PLAYED = 0.6
 
 
 @dataclass(frozen=True)
-class Recipe:
+class FileRecipe:
     """Everything that determines the bytes of one file: `count` episodes of `rows` rows from number `first`."""
 
     level: str
@@ -112,8 +112,8 @@ def collect(
     rules = fingerprint(program.simulator.ruleset)
     name = f"{FAMILY}-{level.name}-play-{VERSION}"
     recipes = {
-        place / f"{name}.npz": Recipe(level.name, rules, seed, 0, train, level.play.steps),
-        place / f"{name}-val.npz": Recipe(level.name, rules, seed, VALIDATION, few, level.play.steps),
+        place / f"{name}.npz": FileRecipe(level.name, rules, seed, 0, train, level.play.steps),
+        place / f"{name}-val.npz": FileRecipe(level.name, rules, seed, VALIDATION, few, level.play.steps),
     }
     with writing(place):
         place.mkdir(parents=True, exist_ok=True)
@@ -131,7 +131,7 @@ def collect(
     return list(recipes)
 
 
-def _write(program: LevelProgram, path: Path, recipe: Recipe, report: Callable[[float], None]) -> None:
+def _write(program: LevelProgram, path: Path, recipe: FileRecipe, report: Callable[[float], None]) -> None:
     about, parts = path.with_suffix(".json"), path.with_suffix(".parts")
     written = read_json(about)
     if written is not None and written != asdict(recipe):
@@ -171,7 +171,7 @@ def _write(program: LevelProgram, path: Path, recipe: Recipe, report: Callable[[
 
 
 def _observations(
-    program: LevelProgram, parts: Path, recipe: Recipe, report: Callable[[float], None]
+    program: LevelProgram, parts: Path, recipe: FileRecipe, report: Callable[[float], None]
 ) -> Iterator[Frames]:
     for numbers in recipe.parts:
         frames = _read_part(parts / f"{numbers[0]:010}.npz", recipe, program.level, len(numbers))
@@ -184,7 +184,7 @@ def _observations(
             report((1 - PLAYED) * len(numbers[few]))
 
 
-def _played(program: LevelProgram, recipe: Recipe, numbers: Numbers) -> Frames:
+def _played(program: LevelProgram, recipe: FileRecipe, numbers: Numbers) -> Frames:
     """The worlds' pictures at the start and after each whole action: uint8 [count, painted + 1, H, W, 3]."""
     actions = recipe.actions(program.level, numbers).astype(np.int64)
     world = program.start(np.full_like(numbers, recipe.seed), numbers)
@@ -218,7 +218,7 @@ def rows_of(program: LevelProgram, frames: Frames, actions: NDArray[np.int16], r
     return frame_rows
 
 
-def _read_part(file: Path, recipe: Recipe, level: Level, count: int) -> Frames | None:
+def _read_part(file: Path, recipe: FileRecipe, level: Level, count: int) -> Frames | None:
     """The frames of a part; None if the file is missing or damaged."""
     shape = (count, recipe.painted + 1, level.side, level.side, 3)
     try:

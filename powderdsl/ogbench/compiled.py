@@ -10,12 +10,12 @@ from numpy.typing import NDArray
 
 from powderdsl.simulation.simulator import World
 from powderdsl.system.random import name_number
-from powderdsl.targets.cpp.episodes import Level
+from powderdsl.targets.cpp.episodes import LevelPlay
 from powderdsl.targets.cpp.program import NativeProgram, PackedState
 from powderdsl.tasks.compiled import Arguments
 
 if TYPE_CHECKING:
-    from powderdsl.ogbench.episodes import Episodes
+    from powderdsl.ogbench.episodes import LevelEpisodes
 
 INVALID = "ogbench invalid"
 """The draws that replace invalid choices."""
@@ -24,7 +24,7 @@ INVALID = "ogbench invalid"
 class CompiledSteps(Arguments):
     """Steps the episodes of a level by calls of native code, which write to their arrays in place."""
 
-    def __init__(self, episodes: Episodes, native: NativeProgram):
+    def __init__(self, episodes: LevelEpisodes, native: NativeProgram):
         super().__init__(native)
         self.native, self._episodes = native, episodes
         self._world: World | None = None
@@ -32,7 +32,7 @@ class CompiledSteps(Arguments):
         program, level = episodes.program, episodes.level
         picture = episodes.pictures[0]
         self._views = program.simulator.observer.views("rgb", native, level.side**2, picture.shape[2])
-        self._structure = structure = Level(
+        self._structure = structure = LevelPlay(
             threads=native.threads,
             elements=level.choices(0),
             places=level.choices(1),

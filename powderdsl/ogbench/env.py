@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from powderdsl.envs.gym import array, objects
 from powderdsl.envs.tensor_env import check_cells, check_going, check_options, mode_of, reset_mask, seeds_of
-from powderdsl.ogbench.episodes import FIRST, MODES, RANDOMNESS, Episodes, LevelProgram, keyed, task_of
+from powderdsl.ogbench.episodes import FIRST, MODES, RANDOMNESS, LevelEpisodes, LevelProgram, keyed, task_of
 from powderdsl.ogbench.levels import GoalTask, Level, find_level
 from powderdsl.system.settings import check_settings, setting
 
@@ -86,10 +86,10 @@ _program = lru_cache(maxsize=16)(LevelProgram)
 
 
 class _Face:
-    """The base of Gymnasium environments that wrap `Episodes`: spaces and pictures."""
+    """The base of Gymnasium environments that wrap `LevelEpisodes`: spaces and pictures."""
 
     metadata: dict[str, Any]
-    episodes: Episodes
+    episodes: LevelEpisodes
     """The same episodes on tensors. Environment i has the seed `seed` + i."""
 
     def _show(self, level: str | Path | Level | LevelProgram, count: int, options: EnvOptions) -> None:
@@ -97,7 +97,7 @@ class _Face:
         self._options, self.level, self.render_mode = options, program.level, options.render_mode
         check_cells(count, (self.level.side, self.level.side))
         seeds = np.arange(count) + options.seed
-        self.episodes = Episodes(program, seeds, randomness=options.randomness, mode=options.mode)
+        self.episodes = LevelEpisodes(program, seeds, randomness=options.randomness, mode=options.mode)
         self._space = Box(0, 255, (self.level.side, self.level.side, 6), np.uint8)
         self._actions = Discrete(self.level.actions)
 

@@ -27,7 +27,7 @@ from powderdsl.simulation.simulator import Simulator, World, compile
 from powderdsl.system.random import MASK, base_keys, mix, name_number
 from powderdsl.targets.cpp.program import PackedState
 from powderdsl.targets.torch.program import TorchProgram
-from powderdsl.tasks.compiled import Rows
+from powderdsl.tasks.compiled import ReusedArray
 from powderdsl.tasks.tensors.actions import Blocks, put_rows, put_worlds, take_worlds
 
 Numbers = NDArray[np.int64]
@@ -171,7 +171,7 @@ def keyed(parts: Sequence[Any], what: str, count: int) -> NDArray[np.float64]:
     return np.asarray(drawn / float(1 << 32), dtype=np.float64)
 
 
-class Draws:
+class EpisodeDraws:
     """Random numbers of environments `which`, int64 [n]: hashes of their seeds, episode numbers and steps."""
 
     fixes_goals = True
@@ -194,7 +194,7 @@ class Draws:
         self._seeds[which] = seed
 
 
-class LegacyDraws(Draws):
+class LegacyDraws(EpisodeDraws):
     """OGBench's order of draws: `numpy.random.RandomState` of its own for each environment, instead of the global one."""
 
     fixes_goals = False
@@ -217,14 +217,14 @@ class LegacyDraws(Draws):
         return np.minimum(single, np.nextafter(1.0, 0.0))
 
 
-class Goal(NamedTuple):
+class GoalWorld(NamedTuple):
     """A goal world: ids uint8 [H, W] and picture uint8 [H, W, 3]."""
 
     ids: Tensor
     picture: Tensor
 
 
-class Episodes:
+class LevelEpisodes:
     """A batch of episodes of one level. Environment i has the seed `seeds`[i]; its first episode has number 0.
 
     Args:
@@ -238,14 +238,14 @@ class Episodes:
         program: LevelProgram,
         seeds: Sequence[int] | Numbers,
         *,
-        randomness: str | Draws = "counter",
+        randomness: str | EpisodeDraws = "counter",
         mode: str = "task",
     ):
         self.program, self.level, self.mode = program, program.level, mode
         self.seeds = np.array(seeds, dtype=np.int64)
         self.count = batch = len(self.seeds)
         if randomness == "counter":
-            randomness = Draws(self.seeds)
+            randomness = EpisodeDraws(self.seeds)
         elif isinstance(randomness, str):
             randomness = LegacyDraws(self.seeds, len(program.streams), self.level.side)
         self._draws = randomness
@@ -266,11 +266,11 @@ class Episodes:
         self.world: World | None = None
         self.pictures = torch.zeros(batch, side, side, 6, dtype=torch.uint8, device=device)
         """The worlds' pictures, without action frames."""
-        self._memory: list[Rows] = []
+        self._memory: list[ReusedArray] = []
         """Of observations."""
         self.goal_ids = torch.zeros(batch, side, side, dtype=torch.uint8, device=device)
         self.goal_pictures = torch.zeros(batch, side, side, 3, dtype=torch.uint8, device=device)
-        self._goals: dict[tuple[int, GoalTask], Goal] = {}
+        self._goals: dict[tuple[int, GoalTask], GoalWorld] = {}
         self._compiled: CompiledSteps | None = None
 
     # Beginning
@@ -327,9 +327,9 @@ class Episodes:
         self.goal_pictures[places] = torch.stack([goal.picture for goal in goals])
         self.tolerance[which] = [task.tolerance for task in tasks]
 
-    def play_goals(self, which: Numbers, tasks: Sequence[GoalTask]) -> list[Goal]:
+    def play_goals(self, which: Numbers, tasks: Sequence[GoalTask]) -> list[GoalWorld]:
         """The goals of tasks, one for each of environments `which`, int64 [n], computed by playing their actions."""
-        goals: dict[int, Goal] = {}
+        goals: dict[int, GoalWorld] = {}
         if not tasks:
             return []
         lists = [self.level.numbers(task) for task in tasks]
@@ -340,7 +340,7 @@ class Episodes:
             if len(left) < len(active):
                 ids, pictures = world.ids, world.rgb()
                 ended = sorted({*range(len(active))}.difference(left))
-                goals |= {active[row]: Goal(ids[row].clone(), pictures[row].clone()) for row in ended}
+                goals |= {active[row]: GoalWorld(ids[row].clone(), pictures[row].clone()) for row in ended}
                 if not left:
                     break
                 world, active = world.select(left), [active[row] for row in left]
@@ -384,7 +384,7 @@ class Episodes:
     def _ready(self) -> CompiledSteps | None:
         """Return the steps in native code; None if the worlds do not run as native code."""
         native = self.program.simulator.native(self.level.side)
-        if native is None or type(self._draws) is not Draws:
+        if native is None or type(self._draws) is not EpisodeDraws:
             return None
         if self._compiled is None or self._compiled.native is not native:
             self._compiled = CompiledSteps(self, native)
@@ -428,9 +428,9 @@ class Episodes:
             frames = torch.from_numpy(self.program.frames(self.stage, *self.chosen[:, :2].T))
             shown = self.pictures.flatten(2) | frames.to(self.pictures.device)
             return shown.view_as(self.pictures)
-        memory = next(filter(Rows.is_free, self._memory), None)
+        memory = next(filter(ReusedArray.is_free, self._memory), None)
         if memory is None:
-            memory = Rows(tuple(self.pictures.shape), np.uint8)
+            memory = ReusedArray(tuple(self.pictures.shape), np.uint8)
             self._memory = [*self._memory[-3:], memory]
         steps.observe(memory.address)
         return torch.from_numpy(memory.rows)

@@ -32,7 +32,7 @@ Count = Annotated[int, Limits(1, 1 << 30)]
 Cells = Annotated[int, Limits(0, 1 << 30)]
 
 
-class Painted(NamedTuple):
+class PaintedBlock(NamedTuple):
     """One painted block: the element's name and the position."""
 
     element: str
@@ -49,20 +49,20 @@ class GoalTask:
 
     name: str
     tolerance: Cells
-    actions: tuple[Painted, ...]
+    actions: tuple[PaintedBlock, ...]
 
 
 @dataclass(frozen=True)
 class TaskInfo:
     """A task as in ``options["task_info"]`` of `reset`."""
 
-    action_seq: tuple[Painted, ...]
+    action_seq: tuple[PaintedBlock, ...]
     tol: Cells
     task_name: str = "task_info"
 
 
 @dataclass(frozen=True)
-class Play:
+class DatasetSizes:
     """The sizes of a level's datasets: numbers of episodes for training and validation, and rows per episode."""
 
     episodes: Count
@@ -89,7 +89,7 @@ class Level:
     grid: Annotated[int, Limits(1, MAX_SIDE)]
     elements: Annotated[tuple[str, ...], Limits(length=(1, 256))]
     steps: Count
-    play: Play
+    play: DatasetSizes
     tasks: tuple[GoalTask, ...]
 
     @property

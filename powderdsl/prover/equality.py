@@ -20,9 +20,9 @@ from powderdsl.prover.symbolic import (
     MAX_SIZE,
     Before,
     Budget,
-    Evaluation,
+    Formulas,
     Layout,
-    Names,
+    Renaming,
     Symbols,
     Term,
     Undecided,
@@ -46,11 +46,11 @@ class Side:
 
     ruleset: Ruleset
     program: Program
-    names: Names
+    names: Renaming
 
     @classmethod
-    def of(cls, ruleset: Ruleset, names: Names | None = None) -> Side:
-        return cls(ruleset, lower(ruleset), names or Names())
+    def of(cls, ruleset: Ruleset, names: Renaming | None = None) -> Side:
+        return cls(ruleset, lower(ruleset), names or Renaming())
 
 
 class Shared:
@@ -170,7 +170,7 @@ def _differ(
         for number in passes:
             outputs = lower_pass(side.program, side.program.passes[number]).outputs
             planes |= {plane: node.type == REAL for plane, node in outputs}
-            world = Evaluation(world, symbols, replace(side.names, fixed=params)).after(outputs)
+            world = Formulas(world, symbols, replace(side.names, fixed=params)).after(outputs)
         afters.append(world)
     ranges = [growing_ranges(side.program) for side in sides]
     known = {}

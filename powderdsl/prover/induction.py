@@ -21,9 +21,9 @@ from powderdsl.prover.symbolic import (
     Before,
     Budget,
     Cell,
-    Evaluation,
-    Names,
+    Formulas,
     Ranges,
+    Renaming,
     Reset,
     Symbols,
     Turned,
@@ -57,7 +57,7 @@ class Transition:
     before: World
     after: World
     ranges: Ranges = field(default_factory=dict)
-    evaluation: Evaluation | None = None
+    evaluation: Formulas | None = None
     moves: tuple[tuple[Node, Offset], ...] = ()
     """Flags of cells that exchange something with a neighbor, and the offset of that neighbor."""
     only_moves: bool | None = None
@@ -65,7 +65,7 @@ class Transition:
     model: Model | None = None
     """The answer to the last question, if any."""
     _facts: dict[object, list[Literal]] = field(default_factory=dict)
-    _evaluations: dict[int, Evaluation] = field(default_factory=dict)
+    _evaluations: dict[int, Formulas] = field(default_factory=dict)
 
     @cached_property
     def questions(self) -> Questions:
@@ -73,7 +73,7 @@ class Transition:
 
     def condition(self, node: Node, world: World, cell: Cell) -> Literal:
         """A condition at a cell of a world."""
-        evaluation = self._evaluations.setdefault(id(world), Evaluation(world, self.symbols))
+        evaluation = self._evaluations.setdefault(id(world), Formulas(world, self.symbols))
         return evaluation.value(node, *cell)
 
     def keeps(self, law: Law, given: Laws = ()) -> bool:
@@ -193,13 +193,13 @@ class Prover:
         pass_, ranges = self.planes[number], self.ranges[number + cut]
         state, known = dict[str, Node](), dict[Node, tuple[str, str]]()
         row = self.start.symbols.layouts["element"]
-        evaluation = Evaluation(begin := Before(symbols := self._symbols(MAX_WHOLE)), symbols)
+        evaluation = Formulas(begin := Before(symbols := self._symbols(MAX_WHOLE)), symbols)
         for place, substep in enumerate(pass_.substeps):
             elements = [(plane, node) for plane, node in substep.writes if plane in row.planes]
             moves = tuple(_moves(elements, known))
             if cut:
                 begin = Before(symbols := self._symbols(MAX_WHOLE))
-                evaluation = Evaluation(begin, symbols)
+                evaluation = Formulas(begin, symbols)
                 evaluation.cut = dict(known)
             before = evaluation.after(state.items())
             state |= dict(substep.writes)
@@ -293,12 +293,12 @@ class Prover:
         transition = Transition("steps", symbols, (start,), start, start)
         world, holds = start, [transition.condition(condition, start, HERE)]
         for step in range(claim.steps - 1):
-            names = Names(
+            names = Renaming(
                 streams={s.name: f"{s.name} {step}" for s in self.ruleset.streams}
             )  # each step draws new numbers
             world = Reset(world, symbols)
             for pass_ in self.planes:
-                world = Evaluation(world, symbols, names).after(pass_.outputs)
+                world = Formulas(world, symbols, names).after(pass_.outputs)
             holds.append(transition.condition(condition, world, HERE))
         return transition if transition.can_be(holds, given) else None
 
@@ -424,9 +424,9 @@ class Prover:
         if any(node.type == REAL for _, node in pass_.outputs):
             raise Undecided("floats in rotated or mirrored worlds")
         turned = Turned(before, symbols, turn)
-        plain = Turned(Evaluation(before, symbols).after(pass_.outputs), symbols, turn)
+        plain = Turned(Formulas(before, symbols).after(pass_.outputs), symbols, turn)
         symbols.turn = turned.place
-        of_turned = Evaluation(turned, symbols).after(pass_.outputs)
+        of_turned = Formulas(turned, symbols).after(pass_.outputs)
         first = [of_turned.bit(plane, *HERE) for plane, _ in pass_.outputs]
         symbols.turn = None
         second = [plain.bit(plane, *HERE) for plane, _ in pass_.outputs]

@@ -393,7 +393,7 @@ class Written:
 
 
 @dataclass(frozen=True)
-class Names:
+class Renaming:
     """The names of another ruleset's parameters and streams. `fixed` has values of parameters."""
 
     params: Mapping[str, str] = field(default_factory=dict)
@@ -404,11 +404,11 @@ class Names:
         return self.streams.get(name, name)
 
 
-class Evaluation:
+class Formulas:
     """Nodes as formulas over an earlier world. Nodes of `cut` may have any value, in the plane that it names."""
 
-    def __init__(self, before: World, symbols: Symbols, names: Names | None = None) -> None:
-        self.before, self.symbols, self.names = before, symbols, names or Names()
+    def __init__(self, before: World, symbols: Symbols, names: Renaming | None = None) -> None:
+        self.before, self.symbols, self.names = before, symbols, names or Renaming()
         self.cut: Mapping[Node, tuple[str, str]] = {}
         self._values: dict[tuple[Node, int, int], int] = {}
 

@@ -23,7 +23,7 @@ from powderdsl.system.cache import Memo
 from powderdsl.system.writing import failure
 from powderdsl.targets.layout import Piece, pieces
 from powderdsl.targets.wasm.source import wasm_module
-from powderdsl.targets.wasm.standalone import Face, Knob, Stored
+from powderdsl.targets.wasm.standalone import ModuleData, ModuleParameter, Stored
 
 FORMAT = 1
 MAX_CELLS = 1 << 22
@@ -66,9 +66,9 @@ def standalone_module(ruleset: Ruleset, size: tuple[int, int], memo: Memo | None
     for param in ruleset.params:
         low, high = map(float, stored_range(param.kind))
         whole = param.kind.name in ("int", "flag")
-        knobs.append(Knob(param.name, float(param.default), low, high, whole))
+        knobs.append(ModuleParameter(param.name, float(param.default), low, high, whole))
     about = json.dumps(_about(ruleset, size, knobs), separators=(",", ":"), ensure_ascii=False).encode()
-    face = Face(size[0], ids, element, fields, tuple(knobs), about)
+    face = ModuleData(size[0], ids, element, fields, tuple(knobs), about)
     return wasm_module(segments[0].planes, size[1], face=face, memo=memo).code
 
 
@@ -91,7 +91,7 @@ def _stored(slot: Slot, ruleset: Ruleset, parts: tuple[Piece, ...]) -> Stored:
     )
 
 
-def _about(ruleset: Ruleset, size: tuple[int, int], knobs: Sequence[Knob]) -> dict[str, Any]:
+def _about(ruleset: Ruleset, size: tuple[int, int], knobs: Sequence[ModuleParameter]) -> dict[str, Any]:
     """The custom section: size, elements, fields and parameters, in the order of their numbers."""
     elements = []
     for element in sorted(ruleset.elements, key=lambda element: element.id):

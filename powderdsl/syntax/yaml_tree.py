@@ -269,7 +269,7 @@ _ENTRY = re.compile(r"\s*(?:- +)?(?P<key>[\w?]+): +(?P<value>[^\"'\s].*?)\s*\Z")
 
 
 @dataclass(frozen=True)
-class Place:
+class StopPosition:
     """The offset at which the parser gave up (`at`), and the start of the value that it was reading (`since`)."""
 
     source: Source
@@ -321,10 +321,10 @@ def report_yaml(error: yaml.YAMLError, source: Source, reporter: Reporter) -> No
     mark = error.problem_mark or error.context_mark
     at = mark.index if mark else 0
     since = error.context_mark.index if error.context_mark else at
-    reporter.add(_explain(Place(source, at, since), f"{error.context}: {error.problem}"))
+    reporter.add(_explain(StopPosition(source, at, since), f"{error.context}: {error.problem}"))
 
 
-def _explain(place: Place, words: str) -> Diagnostic:
+def _explain(place: StopPosition, words: str) -> Diagnostic:
     """The usual mistake behind an error message of PyYAML or libyaml."""
 
     def matches(pattern: str) -> bool:
@@ -389,7 +389,7 @@ def _problem(
     return Diagnostic("PD103", f"invalid YAML: {message}", Label(span, label), others, helps=helps)
 
 
-def _second_colon(place: Place) -> Diagnostic:
+def _second_colon(place: StopPosition) -> Diagnostic:
     before = place.before(place.at)
     if ": " in before or before.rstrip().endswith(":"):
         return _problem("a second `: ` in one line", place.span(place.at), "only a key ends with `:`", QUOTE)
@@ -399,7 +399,7 @@ def _second_colon(place: Place) -> Diagnostic:
     return _problem("a key that is not allowed here", place.span(start, place.at - start), label, fix)
 
 
-def _broken_key(place: Place) -> Diagnostic:
+def _broken_key(place: StopPosition) -> Diagnostic:
     if place.before(place.at).rstrip().endswith(('"', "'")):
         label = "does not belong to the value"
         return _problem("text after a closing quote", place.rest(place.at), label, QUOTE)
@@ -408,13 +408,13 @@ def _broken_key(place: Place) -> Diagnostic:
     return _indentation(place, "not indented like the keys of this mapping")
 
 
-def _indentation(place: Place, label: str) -> Diagnostic:
+def _indentation(place: StopPosition, label: str) -> Diagnostic:
     other = None if place.same_line else Label(place.span(place.since), "which begins here")
     fix = "indent it like its neighbors, or deeper than its own key"
     return _problem("a line that does not line up", place.rest(place.at), label, fix, other)
 
 
-def _unclosed_bracket(place: Place) -> Diagnostic:
+def _unclosed_bracket(place: StopPosition) -> Diagnostic:
     opener, opened = place.text[place.since : place.since + 1], place.span(place.since)
     closer = {"{": "}", "[": "]"}.get(opener, "}")
     comment = _comment(place)
@@ -436,7 +436,7 @@ def _unclosed_bracket(place: Place) -> Diagnostic:
     return _problem(message, opened, "not closed", fix)
 
 
-def _comment(place: Place) -> int | None:
+def _comment(place: StopPosition) -> int | None:
     """The start of a comment between the two offsets; None without one. Quoted text is skipped."""
     quote = ""
     for i in range(place.since, min(place.at, len(place.text))):
@@ -450,11 +450,11 @@ def _comment(place: Place) -> int | None:
     return None
 
 
-def _missing_value(place: Place) -> Diagnostic:
+def _missing_value(place: StopPosition) -> Diagnostic:
     at = min(place.at, len(place.text.rstrip()))
     before = place.before(at)
-    if "{" in before and _comment(Place(place.source, at, at - len(before))) is not None:
-        return _unclosed_bracket(Place(place.source, at, at - len(before) + before.rindex("{")))
+    if "{" in before and _comment(StopPosition(place.source, at, at - len(before))) is not None:
+        return _unclosed_bracket(StopPosition(place.source, at, at - len(before) + before.rindex("{")))
     span = place.span(place.at)
     if place.char in ("}", "]"):
         label = "nothing is open, or a value is missing"

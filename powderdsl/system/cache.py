@@ -43,7 +43,7 @@ UNUSED = 24 * 3600.0
 """Seconds after which other files are removed; until then another process may be at work on them."""
 
 
-class Entry(NamedTuple):
+class CachedFile(NamedTuple):
     """A file in the cache. `used` is the time of its last use, in seconds since the epoch."""
 
     path: Path
@@ -123,29 +123,29 @@ def add(folder: Path, key: str, code: bytes, name: str) -> Path:
     return path
 
 
-def entries(folder: Path) -> list[Entry]:
+def entries(folder: Path) -> list[CachedFile]:
     """The files in the cache, most recently used first."""
     stored = []
     for path in sorted(folder.iterdir()):
         with suppress(OSError):
             if match := NAME.fullmatch(path.name):
                 status = path.stat()
-                stored.append(Entry(path, match[3], status.st_size, status.st_mtime))
+                stored.append(CachedFile(path, match[3], status.st_size, status.st_mtime))
     return sorted(stored, key=lambda entry: -entry.used)
 
 
-def clear(folder: Path) -> list[Entry]:
+def clear(folder: Path) -> list[CachedFile]:
     """Remove and return all files of the cache, except builds in progress in other processes."""
     removed = entries(folder)
     tidy(folder, limit=-1)
     return removed
 
 
-def fused_code(*, remove: bool = False) -> list[Entry]:
+def fused_code(*, remove: bool = False) -> list[CachedFile]:
     """The files that the backend `torch-fused` keeps in its own folder, as one entry; none if there is nothing."""
     folder = cache_folder("inductor")
     sizes = [path.lstat().st_size for path in folder.rglob("*") if path.is_file()]
-    stored = [Entry(folder, "torch-fused", sum(sizes), folder.stat().st_mtime)] if sizes else []
+    stored = [CachedFile(folder, "torch-fused", sum(sizes), folder.stat().st_mtime)] if sizes else []
     if remove:
         _discard(folder)
     return stored

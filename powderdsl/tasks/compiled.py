@@ -75,7 +75,7 @@ class Recycled:
         return [*map(getrefcount, self._arrays)] == self._counts
 
 
-class Rows(Recycled):
+class ReusedArray(Recycled):
     """One array to reuse, such as observations."""
 
     def __init__(self, shape: tuple[int, ...], dtype: Any):

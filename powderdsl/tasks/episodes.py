@@ -20,7 +20,7 @@ from powderdsl.tasks.shipped import check_split, load_task
 from powderdsl.tasks.task import Task
 from powderdsl.tasks.tensors.actions import CLOCK, Hands, put_rows, put_worlds
 from powderdsl.tasks.tensors.generator import StartWorlds
-from powderdsl.tasks.tensors.measures import Facts, Masks, Meter, measures_in, scalar_value, scalars_of
+from powderdsl.tasks.tensors.measures import Masks, Meter, ScalarInputs, measures_in, scalar_value, scalars_of
 
 __all__ = ["Episodes", "TaskProgram", "check_actions", "compile_task", "load_task"]
 
@@ -280,7 +280,7 @@ class TaskProgram:
         action = {"taken": acted, **done}
         if "left" in self._asked:
             action["left"] = agent.actions - acted
-        facts = Facts(self.measure_numbers, now, episodes.start, episodes.before, action)
+        facts = ScalarInputs(self.measure_numbers, now, episodes.start, episodes.before, action)
         success, failed = (
             torch.zeros_like(last) if scalar is None else scalar_value(scalar, facts) != 0
             for scalar in (goal.success, goal.failure)

@@ -10,7 +10,7 @@ from powderdsl.tasks.episodes import Episodes, TaskProgram
 from powderdsl.tasks.goals import parts_of
 from powderdsl.tasks.mixed import MixedEpisodes
 from powderdsl.tasks.task import ExpertMove
-from powderdsl.tasks.tensors.measures import Facts, Meter, measures_in, scalar_value
+from powderdsl.tasks.tensors.measures import Meter, ScalarInputs, measures_in, scalar_value
 from powderdsl.worlds.raster import mask
 
 SIMULATED = 1024
@@ -64,7 +64,7 @@ class ExpertPlayer:
         places = episodes.regions, episodes.targets
         now = self._meter.take(episodes.world, *places, episodes.params, self._meter.masks(*places))
         left = self.program.task.agent.actions - episodes.acted
-        facts = Facts(self._numbers, now, now, now, {"taken": episodes.acted, "left": left})
+        facts = ScalarInputs(self._numbers, now, now, now, {"taken": episodes.acted, "left": left})
         actions = torch.zeros(len(episodes), 5, dtype=torch.int64, device=now.device)
         waiting = torch.ones(len(episodes), dtype=torch.bool, device=now.device)
         for number, move in enumerate(self.expert.moves):

@@ -79,7 +79,7 @@ LIBRARIES = ("lark", "pyyaml")
 
 
 @dataclass(frozen=True)
-class Entry:
+class OfferedRules:
     """Rules that the page offers. `names` are the arguments of `load`; `world` is the user's start world, offered first."""
 
     key: str
@@ -124,7 +124,7 @@ class Entry:
         return self.names == (self.key,) and not self.params and self.world is None
 
 
-def shipped_entries() -> list[Entry]:
+def shipped_entries() -> list[OfferedRules]:
     """The shipped rules that load alone, except variants, followed by each example pack added to the first rules.
 
     Rules that most tasks use come first, then rules with the most elements.
@@ -132,14 +132,14 @@ def shipped_entries() -> list[Entry]:
     tasks = "\n".join(path.read_text(encoding="utf-8") for path in sorted(shipped("tasks").glob("*.yaml")))
     used = Counter(re.findall(r"^rules: *(\S+)", tasks, re.MULTILINE))
     variants = shipped_variants()
-    entries = [Entry(name, (name,)) for name in shipped_tests() if name not in variants]
+    entries = [OfferedRules(name, (name,)) for name in shipped_tests() if name not in variants]
     entries.sort(key=lambda entry: (-used[entry.key], -len(entry.ruleset.elements)))
     examples = sorted(examples_folder().glob("*.yaml"))
     return entries + [_example(path.stem, entries[0].key) for path in examples]
 
 
-def _example(stem: str, rules: str) -> Entry:
-    return Entry(stem, (rules, str(examples_folder() / f"{stem}.yaml")))
+def _example(stem: str, rules: str) -> OfferedRules:
+    return OfferedRules(stem, (rules, str(examples_folder() / f"{stem}.yaml")))
 
 
 def examples_folder() -> Path:
@@ -161,7 +161,7 @@ def shipped_files() -> dict[str, Make]:
     memo = Memo()
     for row in rows:
         key = row["key"]
-        entry = _example(key, rows[0]["key"]) if row["example"] else Entry(key, (key,))
+        entry = _example(key, rows[0]["key"]) if row["example"] else OfferedRules(key, (key,))
         for path, make in _files_of(entry, [tuple(size) for size in row["sizes"]], memo).items():
             makers[path] = partial(cached, path, make)
     return makers
@@ -171,7 +171,7 @@ def _shipped_rows() -> list[dict[str, Any]]:
     return json.loads(cached("shipped.json", lambda: _dump([_row(entry) for entry in shipped_entries()])))
 
 
-def _row(entry: Entry) -> dict[str, Any]:
+def _row(entry: OfferedRules) -> dict[str, Any]:
     """A row of the catalog: `sizes` are the sizes of modules, first that of the user's world."""
     own = [] if entry.world is None else [(entry.world["rows"], entry.world["columns"])]
     sizes = dict.fromkeys([*own, *((side, side) for side in SIZES)])
@@ -183,7 +183,7 @@ def _row(entry: Entry) -> dict[str, Any]:
     }
 
 
-def _files_of(entry: Entry, sizes: list[Size], memo: Memo) -> dict[str, Make]:
+def _files_of(entry: OfferedRules, sizes: list[Size], memo: Memo) -> dict[str, Make]:
     """The files about some rules: a sheet, a picture, and a module for each size."""
     makers: dict[str, Make] = {f"rules/{entry.key}.json": lambda: _dump(_sheet(entry))}
     makers[f"rules/{entry.key}.png"] = lambda: _picture(_sheet(entry), entry.ruleset)
@@ -193,7 +193,7 @@ def _files_of(entry: Entry, sizes: list[Size], memo: Memo) -> dict[str, Make]:
     return makers
 
 
-def _sheet(entry: Entry) -> dict[str, Any]:
+def _sheet(entry: OfferedRules) -> dict[str, Any]:
     ruleset = entry.ruleset
     worlds, shown = offered_worlds(ruleset, entry.names)
     if entry.world is not None:
@@ -229,7 +229,7 @@ class Site:
     `offline`: for another host, where a service worker stores the files.
     """
 
-    def __init__(self, first: Entry | None = None, *, offline: bool = False):
+    def __init__(self, first: OfferedRules | None = None, *, offline: bool = False):
         self.first, self.offline = first, offline
 
     @cached_property

@@ -14,7 +14,7 @@ TEST_SEEDS = 1 << 32
 """The first seed of test worlds. Training uses seeds below it."""
 
 
-class Checked:
+class CheckedSettings:
     """Settings that are checked when they are created."""
 
     def __post_init__(self) -> None:
@@ -22,7 +22,7 @@ class Checked:
 
 
 @dataclass(frozen=True)
-class DataConfig(Checked):
+class DataConfig(CheckedSettings):
     """The pairs that a network learns from. Plain values, which ``dataclasses.asdict`` converts for a run's file.
 
     The worlds have seeds 0 to `states` − 1. Each runs for `steps`·`pairs` steps and gives `pairs` pairs (in the paper,
@@ -62,7 +62,7 @@ class Recorded:
 
 
 @dataclass(frozen=True)
-class TrainConfig(Checked):
+class TrainConfig(CheckedSettings):
     """All settings that determine the weights (on one kind of device). The defaults are the paper's.
 
     `parent` is the name of the checkpoint that a fine-tuned network starts from; without it, weights are random.
@@ -106,7 +106,7 @@ PRESETS = {
 
 
 @dataclass(frozen=True)
-class Machine(Checked):
+class Machine(CheckedSettings):
     """The device and storage of a run, which may resume on another machine.
 
     `store` is that of `Replay`.

@@ -68,7 +68,7 @@ class Worlds(Protocol):
 
 
 @dataclass(frozen=True)
-class Batch:
+class WorldBatch:
     """Worlds with one seed each, possibly under different rulesets: their numbers and episodes by ruleset."""
 
     parts: tuple[tuple[Tensor, Episodes], ...]
@@ -150,7 +150,7 @@ class TaskWorlds:
         """The device of the worlds."""
         self._program = compile_task(task, split=config.split, rulesets=config.rulesets, **machine)
 
-    def start(self, seeds: Tensor) -> Batch:
+    def start(self, seeds: Tensor) -> WorldBatch:
         """The worlds of seeds, int64 [B]."""
         parts, laws = [], torch.zeros(len(seeds), *self.size, dtype=torch.uint8, device=self.device)
         shows = self.config.observation == "laws"
@@ -159,9 +159,9 @@ class TaskWorlds:
             parts.append((places, episodes))
             if shows:
                 laws[places] = law_plane(own, episodes, self._slots)
-        return Batch(tuple(parts), laws if shows else None)
+        return WorldBatch(tuple(parts), laws if shows else None)
 
-    def later(self, world: Batch, steps: int) -> Batch:
+    def later(self, world: WorldBatch, steps: int) -> WorldBatch:
         def stepped(episodes: Episodes) -> Episodes:
             now = episodes.world
             return replace(episodes, world=now.sim.step(now, steps, params=episodes.params or None))

@@ -257,9 +257,9 @@ def test_results_without_references_are_reused():
 
 
 def test_an_array_is_free_without_references_to_it_or_a_view():
-    from powderdsl.tasks.compiled import Rows
+    from powderdsl.tasks.compiled import ReusedArray
 
-    memory = Rows((3,), np.uint8)
+    memory = ReusedArray((3,), np.uint8)
     assert memory.is_free()
     held = memory.rows[:1]
     assert not memory.is_free()

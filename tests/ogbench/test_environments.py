@@ -14,7 +14,7 @@ from gymnasium.vector import AutoresetMode
 
 import powderdsl.ogbench
 from powderdsl.ogbench.env import PowderworldEnv, PowderworldVectorEnv
-from powderdsl.ogbench.episodes import Episodes, LevelProgram
+from powderdsl.ogbench.episodes import LevelEpisodes, LevelProgram
 from powderdsl.ogbench.levels import FOLDER, find_level, read_level, shipped_levels
 from tests.compilers import skip_without_compiler
 
@@ -163,7 +163,7 @@ def test_a_goal_depends_on_the_seed_and_the_task_alone(hard: LevelProgram) -> No
 
 def test_drawn_tasks_and_replaced_actions_are_spread_evenly(easy: LevelProgram) -> None:
     count = 150
-    episodes = Episodes(easy, np.arange(count))
+    episodes = LevelEpisodes(easy, np.arange(count))
     episodes.begin(np.arange(count), [None] * count)
     tasks = np.bincount(episodes.task_number, minlength=6)
     assert tasks[0] == 0

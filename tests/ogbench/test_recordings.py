@@ -13,7 +13,7 @@ import pytest
 
 import powderdsl
 from powderdsl.ogbench.env import EnvOptions, PowderworldEnv
-from powderdsl.ogbench.episodes import Episodes, LegacyDraws
+from powderdsl.ogbench.episodes import LegacyDraws, LevelEpisodes
 
 EXCERPTS = Path(__file__).resolve().parents[1] / "data" / "second" / "ogbench"
 WHOLE = "POWDERDSL_RECORDINGS"
@@ -70,7 +70,7 @@ def follow_planes(folder: Path, level: str) -> int:
     with np.load(folder / "trace_planes.npz") as file:
         recorded = {name.removeprefix(f"{level}_"): file[name] for name in file if name.startswith(level)}
     program = EnvOptions(randomness="ogbench", backend="torch").program(level)
-    episodes = Episodes(program, [0], randomness=Planes(recorded["random"]), mode="data_collection")
+    episodes = LevelEpisodes(program, [0], randomness=Planes(recorded["random"]), mode="data_collection")
     episodes.begin(np.zeros(1, dtype=np.int64), [None])
     steps = len(recorded["random"])
     velocities = dict(enumerate(recorded.get("velocity", ())))
@@ -129,7 +129,7 @@ REPLAYED = {
 """The environment step at which replaying a goal's actions first succeeds in OGBench: exact at the first level."""
 
 
-def first_successes(episodes: Episodes, number: int) -> np.ndarray:
+def first_successes(episodes: LevelEpisodes, number: int) -> np.ndarray:
     """The environment step of first success in each episode of a task, when its own actions are replayed; -1: never."""
     every = np.arange(episodes.count)
     episodes.begin(every, [number] * episodes.count)
@@ -148,7 +148,7 @@ def test_replayed_goals_succeed_when_ogbenchs_do(torch: Any, level: str, randomn
     program = EnvOptions(randomness=randomness, backend="wasm").program(level)
     count = 5 if randomness == "ogbench" else 32
     for number, expected in enumerate(REPLAYED[level], 1):
-        episodes = Episodes(program, np.arange(1000, 1000 + count), randomness=randomness)
+        episodes = LevelEpisodes(program, np.arange(1000, 1000 + count), randomness=randomness)
         first = first_successes(episodes, number)
         assert (first < 0).mean() <= 0.25
         assert abs(np.median(first[first > 0]) - expected) <= (0 if level == "easy" else 16)

@@ -8,7 +8,7 @@ import numpy as np
 
 from powderdsl.compiler import load
 from powderdsl.prover.equality import Side, differs, why_incomparable
-from powderdsl.prover.symbolic import Budget, Names, deep_recursion
+from powderdsl.prover.symbolic import Budget, Renaming, deep_recursion
 from powderdsl.simulation.simulator import compile
 from powderdsl.testing.generators.cases import Start
 from powderdsl.testing.properties.comparison import compare
@@ -61,7 +61,7 @@ passes:
     sims = {most: compile(load_text(pack.replace("MOST", most)), "wasm") for most in ("5", "9")}
     assert compare(sims["5"], sims["9"], 10).status == "equal"
     assert compare(sims["9"], sims["5"], 10).status != "equal"
-    shared = compare(sims["9"], sims["5"], 10, names=Names())
+    shared = compare(sims["9"], sims["5"], 10, names=Renaming())
     assert shared.status == "equal"
     assert shared.given == ("`full` starts with what both can hold",)
 

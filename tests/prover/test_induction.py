@@ -12,7 +12,7 @@ from powderdsl.model.text import one_line
 from powderdsl.model.types import Ruleset
 from powderdsl.prover.induction import Prover
 from powderdsl.prover.solver import OutOfWork, Solver
-from powderdsl.prover.symbolic import Budget, Evaluation, Undecided, deep_recursion
+from powderdsl.prover.symbolic import Budget, Formulas, Undecided, deep_recursion
 from tests.semantics.texts import load_text
 
 SMALL = (
@@ -224,7 +224,7 @@ def test_no_formula_is_made_once_the_budget_is_spent(monkeypatch: pytest.MonkeyP
     ruleset = load_text(f"{PACK}  - mirrored worlds agree\n")
     with deep_recursion():
         prover = Prover(ruleset, Budget(-1))
-        monkeypatch.setattr(Evaluation, "value", pytest.fail)
+        monkeypatch.setattr(Formulas, "value", pytest.fail)
         with pytest.raises(OutOfWork):
             prover.broken(ruleset.invariants[0].claim)
 

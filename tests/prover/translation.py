@@ -15,7 +15,7 @@ from powderdsl.ir.text import structure
 from powderdsl.model.types import Ruleset
 from powderdsl.prover.equality import Side, _differ
 from powderdsl.prover.solver import OutOfWork
-from powderdsl.prover.symbolic import Budget, Names, Undecided, deep_recursion
+from powderdsl.prover.symbolic import Budget, Renaming, Undecided, deep_recursion
 from tests.ir.verify import verify
 
 SECONDS = 60.0
@@ -63,7 +63,7 @@ def compare(
 
 
 def _verdict(ruleset: Ruleset, first: Program, second: Program, number: int, seconds: float) -> str:
-    sides = (Side(ruleset, program, Names()) for program in (first, second))
+    sides = (Side(ruleset, program, Renaming()) for program in (first, second))
     try:
         with deep_recursion():
             difference = _differ(*sides, ((number,), (number,)), Budget.of(seconds), False)

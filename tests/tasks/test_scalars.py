@@ -7,14 +7,14 @@ import torch
 from powderdsl.model.expressions.operators import NUMBER
 from powderdsl.model.types import Expr
 from powderdsl.tasks.task import Measure
-from powderdsl.tasks.tensors.measures import Facts, scalar_value
+from powderdsl.tasks.tensors.measures import ScalarInputs, scalar_value
 
 COUNT = Measure("count", None, None)
 
 
-def facts() -> Facts:
+def facts() -> ScalarInputs:
     now = torch.tensor([[1.0], [2.0], [3.0]], dtype=torch.float64)
-    return Facts({COUNT: 0}, now, now * 10, now * 100, {})
+    return ScalarInputs({COUNT: 0}, now, now * 10, now * 100, {})
 
 
 def test_a_constant_is_a_number_of_its_own_in_each_world() -> None:

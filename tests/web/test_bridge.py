@@ -16,7 +16,7 @@ import wasmtime
 import powderdsl
 from powderdsl.universes import universe_text
 from powderdsl.web import bridge
-from powderdsl.web.site import Entry, shipped_entries
+from powderdsl.web.site import OfferedRules, shipped_entries
 from powderdsl.worlds.store import load_world, world_data
 
 
@@ -35,7 +35,7 @@ def call(name: str, *arguments: Any) -> Any:
 
 
 def files(*names: str) -> dict[str, str]:
-    return Entry("rules", names).files()
+    return OfferedRules("rules", names).files()
 
 
 def test_broken_rules_leave_the_last_good_ones(session: bridge.Session) -> None:

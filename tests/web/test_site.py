@@ -22,13 +22,13 @@ from PIL import Image
 from powderdsl.simulation.standalone import standalone_module
 from powderdsl.web import site as site_module
 from powderdsl.web.bridge import NAME
-from powderdsl.web.site import PAGE, Entry, Site, SiteServer
+from powderdsl.web.site import PAGE, OfferedRules, Site, SiteServer
 from tests.cli.commands import powderdsl as command
 
 
 @pytest.fixture(scope="module")
 def site() -> Site:
-    return Site(Entry("life", ("life",)))
+    return Site(OfferedRules("life", ("life",)))
 
 
 @pytest.fixture
@@ -59,7 +59,7 @@ def test_files_have_their_types(server: SiteServer) -> None:
         status, data, headers = ask(server, path)
         assert (status, headers["Content-Type"], headers["X-Content-Type-Options"]) == (200, kind, "nosniff")
         assert data
-    assert data == standalone_module(Entry("life", ("life",)).ruleset, (64, 64))
+    assert data == standalone_module(OfferedRules("life", ("life",)).ruleset, (64, 64))
 
 
 def test_files_are_sent_compressed_and_once(server: SiteServer) -> None:
@@ -106,7 +106,7 @@ def test_the_page_allows_its_own_code_alone(site: Site) -> None:
 
 def test_a_folder_for_any_web_server(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(site_module, "SIZES", (64,))
-    monkeypatch.setattr(site_module, "shipped_entries", lambda: [Entry("life", ("life",))])
+    monkeypatch.setattr(site_module, "shipped_entries", lambda: [OfferedRules("life", ("life",))])
     monkeypatch.setattr(site_module, "code_version", lambda: "of a test")
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     folder = tmp_path / "site"
@@ -132,7 +132,7 @@ def test_a_folder_for_any_web_server(tmp_path: Path, monkeypatch: pytest.MonkeyP
 
 def test_the_service_worker_has_the_hashes_of_what_a_visit_needs(monkeypatch: pytest.MonkeyPatch) -> None:
     def worker() -> tuple[str, dict[str, str]]:
-        site = Site(Entry("life", ("life",)), offline=True)
+        site = Site(OfferedRules("life", ("life",)), offline=True)
         text = (site.read("sw.js") or b"").decode()
         (version,), (files,) = (
             re.findall(r'powderdsl-\$\{"(\w+)"\}', text),
@@ -213,6 +213,6 @@ def test_without_its_parts_the_command_says_what_to_do(
 
 
 def test_universes_are_files_that_the_page_can_edit() -> None:
-    files = Entry("core-universe-7", ("universe:7",)).files()
+    files = OfferedRules("core-universe-7", ("universe:7",)).files()
     assert list(files) == ["core.yaml", "universe_7.yaml"]
     assert all(NAME.fullmatch(name) for name in files)

@@ -15,7 +15,7 @@ import pytest
 
 from powderdsl.universes import universe_text
 from powderdsl.web import site as site_module
-from powderdsl.web.site import Entry, Site
+from powderdsl.web.site import OfferedRules, Site
 from tests.web.test_page import HERE, needed
 from tests.wheels import succeed
 
@@ -33,7 +33,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     made = tmp_path_factory.mktemp("exported")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(site_module, "SIZES", (64,))
-        entries = [Entry(name, (name,)) for name in ("powderworld", "life")]
+        entries = [OfferedRules(name, (name,)) for name in ("powderworld", "life")]
         patch.setattr(site_module, "shipped_entries", lambda: entries)
         patch.setattr(site_module, "code_version", lambda: "of a test")
         patch.setenv("XDG_CACHE_HOME", str(made))

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import click
 
 from powderdsl.cli.output import counted
-from powderdsl.system.cache import Entry, clear, compiled_folder, entries, fused_code
+from powderdsl.system.cache import CachedFile, clear, compiled_folder, entries, fused_code
 from powderdsl.system.reports import table
 
 
@@ -47,5 +47,5 @@ def print_path() -> None:
     click.echo(compiled_folder())
 
 
-def _megabytes(entries: Sequence[Entry]) -> str:
+def _megabytes(entries: Sequence[CachedFile]) -> str:
     return f"{sum(entry.size for entry in entries) / 1e6:.1f} MB"

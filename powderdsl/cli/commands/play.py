@@ -34,7 +34,7 @@ def command(
 
     The page is served only on this machine and runs in the browser: it sends no data anywhere.
     """
-    from powderdsl.web.site import PARTS, Entry, Site
+    from powderdsl.web.site import PARTS, OfferedRules, Site
 
     if not (PARTS / "editor.js").is_file():
         raise BadInput(
@@ -54,7 +54,7 @@ def command(
 
             drawn = first_world_data(begin(ruleset, world, None, None, None))
             start = {"name": Path(world).name, "about": "", **drawn}
-        first = Entry(key, (rules,), settings, start)
+        first = OfferedRules(key, (rules,), settings, start)
     site = Site(first, offline=export is not None)
     if export is not None:
         click.echo(f"{export}: {site.write(export)} files")

@@ -35,7 +35,7 @@ class Cause:
 
 
 @dataclass(frozen=True)
-class Difference:
+class ScopeDifference:
     """The reason that packs outside a scope change a claim or a warning.
 
     `packs` are the relevant added packs, in load order; `causes` are the known locations in their files.

@@ -1,4 +1,4 @@
-"""The data layouts for stepping episodes in one call: `Play` of episodes.hpp, and `Level` of levels.hpp."""
+"""The data layouts for stepping episodes in one call: `Play` of episodes.hpp, and `LevelPlay` of levels.hpp."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ class Play(ctypes.Structure):
     )
 
 
-class Level(ctypes.Structure):
+class LevelPlay(ctypes.Structure):
     """Everything that a step of an OGBench level reads and writes. Addresses point to arrays that the caller keeps."""
 
     _fields_ = _whole(

@@ -2,7 +2,7 @@
 // step and a block is painted. Arrays are the caller's, with a row for each world; see targets/cpp/episodes.py. Comes after the
 // episodes.
 
-struct Level {
+struct LevelPlay {
   int64_t threads, elements, places;  // how many can be chosen
   const int64_t* edges[2];            // first row of the block at each y, and the one after its last; then columns
   int64_t fresh_count, element, element_bits;
@@ -21,7 +21,7 @@ struct Level {
   const uint8_t* goals;
   uint8_t* pictures;
 };
-static int64_t drawn_choice(const Level& p, int i, int64_t count) {  // as `keyed` of ogbench/episodes.py
+static int64_t drawn_choice(const LevelPlay& p, int i, int64_t count) {  // as `keyed` of ogbench/episodes.py
   u32 keys[2];
   for (int half = 0; half < 2; half++)
     keys[half] = mix(mix(world_key(p.seed[i], p.index[i], half) + (u32)p.elapsed[i]) + (u32)p.name);
@@ -60,8 +60,8 @@ static int64_t missed_in(const Batch& b, int world, int slot, int bits, const ui
   return sum;
 }
 // Takes a choice in the episodes that are `active`. Choices out of range are replaced.
-API void pd_choose(Level* level, const int64_t* actions, const uint8_t* active) {
-  Level& p = *level;
+API void pd_choose(LevelPlay* level, const int64_t* actions, const uint8_t* active) {
+  LevelPlay& p = *level;
   Batch& b = *(Batch*)p.batch;
   std::vector<int> painted;
   std::vector<int64_t> boxes(4 * b.worlds), elements(b.worlds);
@@ -96,8 +96,8 @@ static void lay_over(const uint8_t* picture, const uint8_t* row, int64_t line, i
   }
 }
 // Observations: pictures, with the action frame in each row.
-API void pd_observe(const Level* level, uint8_t* observed, int worlds) {
-  const Level& p = *level;
+API void pd_observe(const LevelPlay* level, uint8_t* observed, int worlds) {
+  const LevelPlay& p = *level;
   std::vector<uint8_t> frame(p.line);
   for (int i = 0; i < worlds; i++) {
     const uint8_t* color = p.colors + (p.stage[i] > 0 ? p.chosen[3 * i] + 1 : 0) * p.line;

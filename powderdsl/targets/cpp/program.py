@@ -74,7 +74,7 @@ def remember(key: str, code: NativeCode) -> None:
         cache.add(current().place(), key, pickle.dumps(code), f"{code.library.name.split('-')[2]}.layout")
 
 
-class Inputs(NamedTuple):
+class ParameterArrays(NamedTuple):
     """The parameters of a batch as generated code reads them: flags uint8 [n, B], floats float32 [m, B]."""
 
     params: Mapping[str, Tensor]
@@ -212,7 +212,7 @@ class NativeProgram(Places):
         super().__init__(code.layout, code.pieces)
         self.library = load_library(code.library)
         self.code, self.threads = code, threads
-        self._inputs: dict[int, Inputs] = {}
+        self._inputs: dict[int, ParameterArrays] = {}
         """Keyed by the `id` of the mapping, which the inputs keep alive."""
 
     def run(self, job: Job) -> Mapping[str, Tensor]:
@@ -233,7 +233,7 @@ class NativeProgram(Places):
                 job.timing.add(name, spent)
         return PackedState(self, handle, packed.like)
 
-    def inputs(self, params: Mapping[str, Tensor], batch: int) -> Inputs:
+    def inputs(self, params: Mapping[str, Tensor], batch: int) -> ParameterArrays:
         """The inputs of some parameters, kept for the next call with the same mapping."""
         if (known := self._inputs.get(id(params))) is not None:
             return known
@@ -241,7 +241,7 @@ class NativeProgram(Places):
         bits, floats = parameters(torch, params, layout.param_planes, layout.param_reals, batch)
         if len(self._inputs) >= KEPT_INPUTS:
             self._inputs = {}  # not cleared: another thread may be reading it
-        self._inputs[id(params)] = inputs = Inputs(params, bits, floats)
+        self._inputs[id(params)] = inputs = ParameterArrays(params, bits, floats)
         return inputs
 
     def pack(self, state: Mapping[str, Tensor]) -> PackedState:

@@ -25,7 +25,7 @@ Kinds are `draws`, `limit`, `bit`, `real`, `step` and those of `packed.FIXED`.
 """
 
 
-class Source(NamedTuple):
+class PassSource(NamedTuple):
     """The source of a pass, the name of its function, and the keys of its inputs in order."""
 
     text: str
@@ -33,7 +33,7 @@ class Source(NamedTuple):
     inputs: tuple[Key, ...]
 
 
-def pass_source(program: Program, pass_: PassGraph, number: int) -> Source:
+def pass_source(program: Program, pass_: PassGraph, number: int) -> PassSource:
     """The source of a pass of a program on bit planes. `number` makes the name unique."""
     writer = _Writer(program, pass_)
     returned = writer.body()
@@ -42,7 +42,7 @@ def pass_source(program: Program, pass_: PassGraph, number: int) -> Source:
     header = [f"# {comment_of(pass_.name)}"]
     header += [f"# inputs[{i}]: {comment_of(' '.join(map(str, key)))}" for i, key in enumerate(writer.inputs)]
     text = [*header, f"def {name}(k, words, fields, inputs):", *lines, f"    return {returned}", ""]
-    return Source("\n".join(text), name, tuple(writer.inputs))
+    return PassSource("\n".join(text), name, tuple(writer.inputs))
 
 
 def planes_source(program: Program, only: str | None = None) -> str:

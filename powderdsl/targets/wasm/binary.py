@@ -1,6 +1,6 @@
 """The binary format of WebAssembly: typed expressions, functions, modules, and their text.
 
-An expression (`Value`) is code that leaves a value on the stack, with its type. Variables and items in memory (`Place`)
+An expression (`Value`) is code that leaves a value on the stack, with its type. Variables and items in memory (`Settable`)
 are expressions that can be set. Statements belong to the function that is being written (`body`): `at += 16` changes a
 variable when the function runs, `at + 16` is an expression. Nothing here depends on rules or planes.
 """
@@ -181,25 +181,25 @@ class Value:
     def __invert__(self) -> Value:
         return op("v128.not", self)
 
-    def __getitem__(self, member: Member) -> Place:
+    def __getitem__(self, member: Member) -> Settable:
         """A member of the record at this address."""
         return load(member.load, self, member.offset)
 
     def __setitem__(self, member: Member, value: Value | int) -> None:
         place = self[member]
-        if not isinstance(value, Place) or value.code != place.code:  # after `|=`, it has been set
+        if not isinstance(value, Settable) or value.code != place.code:  # after `|=`, it has been set
             place.set(value)
 
 
 def _in_place(operator: str) -> Callable[[Any, Value | int], Any]:
-    def change(self: Place, other: Value | int) -> Place:
+    def change(self: Settable, other: Value | int) -> Settable:
         self.set(getattr(self, operator)(other))
         return self
 
     return change
 
 
-class Place(Value):
+class Settable(Value):
     """A value that can be set, by code before and after the code of its new value."""
 
     __slots__ = ("after", "before")
@@ -216,7 +216,7 @@ class Place(Value):
     __ilshift__, __irshift__ = _in_place("__lshift__"), _in_place("__rshift__")
 
 
-class _Variable(Place):
+class _Variable(Settable):
     __slots__ = ("index",)
     get: bytes
     put: bytes
@@ -285,11 +285,11 @@ def floats(number: float) -> Value:
 _ALIGN = {"v128": 4, "i64": 3, "f64": 3, "i32": 2, "f32": 2, "8": 0, "16": 1, "32": 2, "64": 3}
 
 
-def load(name: str, address: Value | int, offset: int = 0) -> Place:
+def load(name: str, address: Value | int, offset: int = 0) -> Settable:
     """An item in memory, which an instruction such as ``v128.load`` reads."""
     before = _codes([address], "i32")
     get, put = _accesses(name, offset)
-    return Place(RESULTS[name], before + get, before, put)
+    return Settable(RESULTS[name], before + get, before, put)
 
 
 @cache

@@ -19,7 +19,7 @@ from powderdsl.targets.wasm.binary import (
     Callee,
     Global,
     Local,
-    Place,
+    Settable,
     Value,
     Writer,
     body,
@@ -73,7 +73,7 @@ class Batches:
             at = (at + batch[WORLDS] * size + 15) & ~15
         return at
 
-    def clock_of(self, batch: Value, what: int, world: Value) -> Place:
+    def clock_of(self, batch: Value, what: int, world: Value) -> Settable:
         """Seed, index or step of a world."""
         return load("i64.load", self.part(batch, 0) + ((batch[WORLDS] * what + world) << 3))
 

@@ -34,7 +34,7 @@ from powderdsl.targets.wasm.binary import (
     Local,
     Member,
     Module,
-    Place,
+    Settable,
     Value,
     body,
     const,
@@ -193,7 +193,7 @@ def choose(mask: Value, yes: Value, no: Value) -> Value:
     return op("v128.bitselect", yes, no, mask)
 
 
-def word(address: Value | int, offset: int = 0) -> Place:
+def word(address: Value | int, offset: int = 0) -> Settable:
     return load("i32.load", address, offset)
 
 
@@ -248,7 +248,7 @@ class Library:
         return self._more[: max(count, 0)]
 
     @property
-    def present(self) -> Place:
+    def present(self) -> Settable:
         """The ids that are present in the group that runs."""
         return self.group[self.memory.present]
 

@@ -35,7 +35,7 @@ from powderdsl.targets.wasm.cells import CellLoop
 from powderdsl.targets.wasm.driver import Driver
 from powderdsl.targets.wasm.library import MAX_PARAMS, PAGE, SOME, ZERO, Library, Memory, extent_of, word
 from powderdsl.targets.wasm.moves import exchanger, groups_in_place, move_groups
-from powderdsl.targets.wasm.standalone import Face, Standalone
+from powderdsl.targets.wasm.standalone import ModuleData, Standalone
 from powderdsl.targets.wasm.words import WordLoop
 
 ONE = const("i32", 1)
@@ -46,7 +46,7 @@ PAGES = 1 << 15
 
 @collection_paused()
 def wasm_module(
-    program: Program, width: int | None, *, face: Face | None = None, memo: Memo | None = None
+    program: Program, width: int | None, *, face: ModuleData | None = None, memo: Memo | None = None
 ) -> Module:
     """The module of a program on planes, for grids of this width; None: of any width below that of a word.
 
@@ -58,7 +58,7 @@ def wasm_module(
     module = Module(memory.top // PAGE + 1, PAGES)
     library, passes = Library(memory, module), []
     for schedule in schedules:
-        passes.append(module.define(Pass(schedule, library).write, pass_function_name(schedule.name)))
+        passes.append(module.define(PassCode(schedule, library).write, pass_function_name(schedule.name)))
     tested = reduce(or_, map(tested_ids, schedules), 0)
     calls = Driver(library, program, passes, tested).add(export=face is None)
     if face is not None:
@@ -78,7 +78,7 @@ def pass_function_name(name: str) -> str:
     return f"pass_{name}"
 
 
-class Pass(Printer):
+class PassCode(Printer):
     """Variables are locals that hold the addresses of planes and fields."""
 
     def __init__(self, schedule: Schedule, library: Library):

@@ -57,7 +57,7 @@ class Stored:
 
 
 @dataclass(frozen=True)
-class Knob:
+class ModuleParameter:
     """A parameter: its name, default and range."""
 
     name: str
@@ -68,21 +68,21 @@ class Knob:
 
 
 @dataclass(frozen=True)
-class Face:
+class ModuleData:
     """The data of a standalone module; `about` is for the custom section."""
 
     rows: int
     ids: tuple[int, ...]
     element: Piece
     fields: tuple[Stored, ...]
-    knobs: tuple[Knob, ...]
+    knobs: tuple[ModuleParameter, ...]
     about: bytes
 
 
 class Standalone(Batches):
     """Makes the functions of one world, on those of batches (`calls`)."""
 
-    def __init__(self, library: Library, face: Face, calls: dict[str, Callee]):
+    def __init__(self, library: Library, face: ModuleData, calls: dict[str, Callee]):
         super().__init__(library)
         self.face, self.calls = face, calls
         self.batch = library.module.variable("i32")
@@ -272,7 +272,7 @@ class Standalone(Batches):
         for knob in _of_number(number, self.face.knobs):
             self._set_knob(knob, value)
 
-    def _set_knob(self, knob: Knob, value: Local) -> None:
+    def _set_knob(self, knob: ModuleParameter, value: Local) -> None:
         """Store a parameter's value, clamped to its range, as bits and floats."""
         layout = self.layout
         value.set(_within(value, knob.low, knob.high))

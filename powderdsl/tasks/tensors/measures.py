@@ -311,7 +311,7 @@ class _Cells:
 
 
 @dataclass(frozen=True)
-class Facts:
+class ScalarInputs:
     """The inputs of a scalar: measures now, at the start and before the action, float64 [B, n]; and the action."""
 
     measures: Mapping[Measure, int]
@@ -321,13 +321,13 @@ class Facts:
     action: Mapping[str, Tensor]
 
 
-def scalar_value(scalar: Expr, facts: Facts) -> Tensor:
+def scalar_value(scalar: Expr, facts: ScalarInputs) -> Tensor:
     """The value of an expression in each world: float64 [B]; conditions are 0 or 1."""
     value = _value(scalar, facts)
     return value if value.ndim else value.expand(len(facts.now)).clone()
 
 
-def _value(scalar: Expr, facts: Facts) -> Tensor:
+def _value(scalar: Expr, facts: ScalarInputs) -> Tensor:
     """The result of `scalar_value`, or float64 [] if all worlds have the same value."""
     match scalar.op:
         case "const":

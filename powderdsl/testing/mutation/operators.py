@@ -154,7 +154,7 @@ def _whole(node: Node) -> Span:
 
 
 @dataclass(frozen=True)
-class Names:
+class NamesByKind:
     """Names by kind, in the order of the files. `own` are those of the mutated pack; `local` are its `let` values."""
 
     kinds: dict[str, str]
@@ -181,12 +181,12 @@ class Names:
             ring.sort(key=lambda other: other not in self.own)
         return [*dict.fromkeys([*ring[:1], *ring[-1:]])]
 
-    def with_lets(self, lets: dict[str, str]) -> Names:
+    def with_lets(self, lets: dict[str, str]) -> NamesByKind:
         kinds = {**self.kinds, **dict.fromkeys(lets, "let")}
         return replace(self, kinds=kinds, own=self.own | frozenset(lets), local=lets)
 
 
-def names_of(packs: Sequence_[PackDecl], pack: PackDecl) -> Names:
+def names_of(packs: Sequence_[PackDecl], pack: PackDecl) -> NamesByKind:
     """The names that rules of a pack can say."""
     kinds: dict[str, str] = dict.fromkeys(KERNELS, "kernel")
     own: set[str] = set()
@@ -206,7 +206,7 @@ def names_of(packs: Sequence_[PackDecl], pack: PackDecl) -> Names:
     bounds = {name: re.fullmatch(r"(-?\d+)\s*\.\.\s*(-?\d+)", text) for name, text in types.items()}
     ranges = {name: (int(match[1]), int(match[2])) for name, match in bounds.items() if match}
     flags = frozenset(name for name, text in types.items() if text == "flag")
-    return Names(kinds, frozenset(own), ranges, flags)
+    return NamesByKind(kinds, frozenset(own), ranges, flags)
 
 
 def _typed(decls: Iterable[TypedDecl], kind: str) -> dict[str, str]:
@@ -282,7 +282,7 @@ def mutants_of(pack: PackDecl, packs: Sequence_[PackDecl]) -> list[Mutant]:
 # Lines
 
 
-def word_changes(line: Span, names: Names) -> Changes:
+def word_changes(line: Span, names: NamesByKind) -> Changes:
     """Each word, sign and number of a line in place of which another one stands."""
     for match in WORD.finditer(line.text):
         word = match[0]
@@ -336,7 +336,7 @@ def numbers(operator: str, span: Span, pattern: str, others: Callable[[str], lis
             yield Change(operator, span.start + match.start(), span.start + match.end(), other)
 
 
-def syntax_changes(node: Syntax, names: Names) -> Changes:
+def syntax_changes(node: Syntax, names: NamesByKind) -> Changes:
     """Mistakes in the parts of a line, besides other words."""
     kind = node.text if node.kind == "call" else node.kind
     if kind == "in_" and names.kind(node.children[1].text) == "kernel":
@@ -374,7 +374,7 @@ def is_neighbor(word: str) -> bool:
     return SIMILAR.get(word, ("",))[0] == "neighbor"
 
 
-def _attribute(node: Syntax, names: Names) -> Changes:
+def _attribute(node: Syntax, names: NamesByKind) -> Changes:
     """The neighbor alone, or the value here."""
     before = node.children[0].span.text
     if is_neighbor(node.text) or not (node.text in SIMILAR or names.kind(node.text)):
@@ -383,7 +383,7 @@ def _attribute(node: Syntax, names: Names) -> Changes:
         yield replace_text("neighbor", node.span, node.text)
 
 
-def _call(node: Syntax, names: Names) -> Changes:
+def _call(node: Syntax, names: NamesByKind) -> Changes:
     """Another neighborhood to count in."""
     counted = extents(node)[-1]
     has_kernel = any(
@@ -395,21 +395,21 @@ def _call(node: Syntax, names: Names) -> Changes:
             yield replace_text("kernel", counted, f"{text} in {kernel}")
 
 
-def _tuple(node: Syntax, names: Names) -> Changes:
+def _tuple(node: Syntax, names: NamesByKind) -> Changes:
     """A missing member."""
     for number in range(len(node.children)):
         operator = "side" if is_neighbor(node.children[0].text) else "set"
         yield without(operator, extents(node), number)
 
 
-def _binding(node: Syntax, names: Names) -> Changes:
+def _binding(node: Syntax, names: NamesByKind) -> Changes:
     """A loop in another order."""
     domain = node.children[1]
     if domain.kind == "tuple":
         yield exchange_texts("order", extents(domain)[0], extents(domain)[-1])
 
 
-def _rule(node: Syntax, names: Names) -> Changes:
+def _rule(node: Syntax, names: NamesByKind) -> Changes:
     """A rule without its condition or its chance, or the other way round."""
     sides = node.children[:2]
     if node.kind == "transform" and {side.kind for side in sides} <= {"name", "optional_name"}:
@@ -430,7 +430,7 @@ def _negations(node: Syntax) -> Changes:
         yield Change("negation", node.span.start, node.span.start, "not ")
 
 
-def _effects(node: Syntax, names: Names) -> Changes:
+def _effects(node: Syntax, names: NamesByKind) -> Changes:
     if len(node.children) == 1:
         yield replace_text("effect", node.span, "")
         return
@@ -438,7 +438,7 @@ def _effects(node: Syntax, names: Names) -> Changes:
         yield without("effect", [child.span for child in node.children], number)
 
 
-MISTAKES: dict[str, Callable[[Syntax, Names], Changes]] = {
+MISTAKES: dict[str, Callable[[Syntax, NamesByKind], Changes]] = {
     "call": _call,
     "attribute": _attribute,
     "tuple": _tuple,
@@ -459,7 +459,7 @@ class Entry:
     key: Scalar
     node: Node
     path: Path
-    names: Names
+    names: NamesByKind
 
     @property
     def siblings(self) -> dict[str, tuple[Scalar, Node]]:
@@ -505,7 +505,7 @@ class Entry:
 EntryMistake = Callable[[Entry], Iterable[Change]]
 
 
-def entries_of(node: Node, path: Path, names: Names) -> Iterator[Entry]:
+def entries_of(node: Node, path: Path, names: NamesByKind) -> Iterator[Entry]:
     """The entries of a mapping, or of the mappings in a list."""
     if isinstance(node, yaml_tree.Mapping):
         for number, (key, value) in enumerate(node.entries):

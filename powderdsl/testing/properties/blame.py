@@ -9,7 +9,7 @@ from typing import Any
 from powderdsl.arrays import np
 from powderdsl.diagnostics import Span
 from powderdsl.model.check import without_pack
-from powderdsl.model.composition.added_packs import Cause, Difference
+from powderdsl.model.composition.added_packs import Cause, ScopeDifference
 from powderdsl.model.declarations import PackDecl
 from powderdsl.model.state import slots
 from powderdsl.model.text import one_line
@@ -77,7 +77,7 @@ def translated(sample: Start, ruleset: Ruleset, target: Ruleset) -> Start | None
     return replace(sample, ids=table[sample.ids].astype(np.uint8), fields=fields, params=params)
 
 
-def difference(prop: Property, ruleset: Ruleset, counterexample: Counterexample) -> Difference:
+def difference(prop: Property, ruleset: Ruleset, counterexample: Counterexample) -> ScopeDifference:
     """The added packs that break an invariant which holds in its scope, and how they do it."""
     packs = added = ruleset.added_to(prop.scope)
     causes = _rules(ruleset, counterexample.culprits, added)
@@ -100,10 +100,10 @@ def difference(prop: Property, ruleset: Ruleset, counterexample: Counterexample)
     near = frozenset(element.name for element in ruleset.elements if element.id in there)
     causes = causes or [cause for pack in packs for cause in pack_changes(pack, ruleset, near)]
     named = {cause.pack for cause in causes}
-    return Difference(tuple(pack for pack in packs if pack in named) or packs, tuple(causes))
+    return ScopeDifference(tuple(pack for pack in packs if pack in named) or packs, tuple(causes))
 
 
-def difference_of_test(result: ExampleResult, runner: Runner) -> Difference | None:
+def difference_of_test(result: ExampleResult, runner: Runner) -> ScopeDifference | None:
     """Explain how added packs change a test: by their own rules, or else by their changes to other packs."""
     if not result.added:
         return None
@@ -117,7 +117,7 @@ def difference_of_test(result: ExampleResult, runner: Runner) -> Difference | No
     causes += [
         cause for pack in result.added if pack not in named for cause in pack_changes(pack, ruleset, near)
     ]
-    return Difference(result.added, tuple(causes))
+    return ScopeDifference(result.added, tuple(causes))
 
 
 def _lines_that_happened(ruleset: Ruleset, state: Mapping[str, Any]) -> list[Span]:

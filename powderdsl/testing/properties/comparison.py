@@ -13,7 +13,7 @@ from powderdsl.ir.bits import NotBits
 from powderdsl.model.types import Ruleset
 from powderdsl.prover.equality import Side, differs, has_own_parameters, narrowed, why_incomparable
 from powderdsl.prover.questions import Model
-from powderdsl.prover.symbolic import Budget, Names, Undecided, deep_recursion
+from powderdsl.prover.symbolic import Budget, Renaming, Undecided, deep_recursion
 from powderdsl.simulation.simulator import Simulator, compile
 from powderdsl.testing.generators.cases import Array, Start
 from powderdsl.testing.properties.models import starts
@@ -63,7 +63,7 @@ def compare(
     seconds: float,
     focus: Sequence[int] = (),
     seed: int = 0,
-    names: Names | None = None,
+    names: Renaming | None = None,
     search: bool = True,
 ) -> Comparison:
     """Prove that two rulesets are equal, or, with `search`, find a small world on which they differ.
@@ -110,7 +110,7 @@ def compare_rules(first: Ruleset, name: str, second: Ruleset, seconds: float) ->
         ids = {stream.name: stream.ident for stream in first.streams}
         renamed = [replace(s, ident=ids.get(streams.get(s.name, s.name), s.ident)) for s in second.streams]
         other = compile(replace(second, streams=tuple(renamed)), "wasm", tensors=False)
-        result = compare(sim, other, seconds, names=Names(params, streams), search=not results)
+        result = compare(sim, other, seconds, names=Renaming(params, streams), search=not results)
         results.append(result)
         if result.status == "equal":
             given = (
@@ -171,7 +171,7 @@ def distinguish(
     focus: Sequence[int] = (),
     seed: int = 0,
     model: Model | None = None,
-    names: Names | None = None,
+    names: Renaming | None = None,
 ) -> Distinction | None:
     """A small world on which two simulators differ, or None if none was found.
 
@@ -179,7 +179,7 @@ def distinguish(
     Equal seeds give the same worlds. `names`: as for `compare`.
     """
     slots = tuple(slot.name for slot in first.slots if slot.name in {other.name for other in second.slots})
-    sides = (first, Names()), (second, names or Names())
+    sides = (first, Renaming()), (second, names or Renaming())
     streams = [replace(s, name=words.stream(s.name)) for sim, words in sides for s in sim.ruleset.streams]
 
     def states(draws: Draws, sample: Start, steps: int) -> Iterator[list[State]]:

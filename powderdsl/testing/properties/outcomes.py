@@ -14,7 +14,7 @@ import yaml
 
 from powderdsl.arrays import np
 from powderdsl.diagnostics import CompileError, Reporter, Span
-from powderdsl.model.composition.added_packs import Difference
+from powderdsl.model.composition.added_packs import ScopeDifference
 from powderdsl.model.state import slots
 from powderdsl.model.text import one_line, place_of, show_single
 from powderdsl.model.types import Invariant, Ruleset
@@ -93,7 +93,7 @@ class Result:
     sample: Start | None = None
     steps: int = 0
     counterexample: Counterexample | None = None
-    difference: Difference | None = None
+    difference: ScopeDifference | None = None
 
     @property
     def is_proven(self) -> bool:
@@ -125,13 +125,13 @@ def result_line(result: Result) -> str:
     return f"{status:<9} {result.prop.owner}: {result.prop.text} ({how})"
 
 
-def difference_words(difference: Difference) -> str:
+def difference_words(difference: ScopeDifference) -> str:
     """``with `steam`: steam.yaml:17``: the packs, and where in their files the reason stands."""
     places = dict.fromkeys(place_of(cause.span) for cause in difference.causes)
     return f"{difference.with_packs}{': ' if places else ''}{', '.join(places)}"
 
 
-def difference_lines(difference: Difference) -> Iterator[str]:
+def difference_lines(difference: ScopeDifference) -> Iterator[str]:
     """The places in the added packs that make the difference."""
     for cause in difference.causes:
         yield f"{place_of(cause.span)}: {cause.does}"

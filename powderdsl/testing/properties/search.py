@@ -15,7 +15,7 @@ from powderdsl.analysis.proofs import prove
 from powderdsl.arrays import np
 from powderdsl.diagnostics import Diagnostic, Label, Reporter
 from powderdsl.model.check import select_packs
-from powderdsl.model.composition.added_packs import Cause, Difference
+from powderdsl.model.composition.added_packs import Cause, ScopeDifference
 from powderdsl.model.text import place_of
 from powderdsl.model.types import Never, Ruleset, Symmetric
 from powderdsl.prover.verdicts import judgments
@@ -267,7 +267,7 @@ def refuted(ruleset: Ruleset, results: Sequence[Result]) -> tuple[Diagnostic, ..
 
 
 def _report_difference(
-    result: Result, difference: Difference, world: Sequence[str], reporter: Reporter
+    result: Result, difference: ScopeDifference, world: Sequence[str], reporter: Reporter
 ) -> None:
     assert result.counterexample is not None
     first, *others = difference.causes
