@@ -1,8 +1,8 @@
 """Caches of results: files, added atomically and checked before they are loaded, and memos in memory.
 
-<key>-<digest>-<name>    a library, a GPU kernel, or the result of a stage; modified when it was last used
-<key>.lock               held by the process that compiles
-.powderdsl-…             being added, or a compiler's
+<ke>/<key>-<digest>-<name>    a library, a GPU kernel, or the result of a stage; modified when it was last used
+<key>.lock                    held by the process that compiles
+.powderdsl-…                  being added, or a compiler's
 """
 
 from __future__ import annotations
@@ -27,12 +27,11 @@ from powderdsl.system.writing import cache_folder, scratch_folder
 T = TypeVar("T")
 
 NAME = re.compile(r"([0-9a-f]+)-([0-9a-f]{64})-(.+)")
+HOME = re.compile(r"[0-9a-f]{1,2}")
+"""The name of a folder of files: the first digits of their keys. Searching a folder of all files would take long."""
 
-LIMIT = 512 << 20
-"""Maximum bytes of files; above it, the least recently used are removed."""
-
-MOST = 2000
-"""Maximum number of files, so that searching the folder stays fast."""
+LIMIT, MOST = 512 << 20, 4000
+"""Maximum number of bytes, and of files. The least recently used are removed first."""
 
 STORED = sys.platform != "emscripten"
 """Whether results of stages are stored: files do not outlive a page, and editors make new ones with each key."""
@@ -97,7 +96,7 @@ def persistent(name: str, inputs: str | Callable[[], str], make: Callable[[], T]
 
 def find(folder: Path, key: str) -> Path | None:
     """The file of a key, marked as used; None if it is missing or damaged."""
-    for path in sorted(folder.glob(f"{key}-*")):
+    for path in sorted(folder.glob(f"{key[:2]}/{key}-*")):
         match = NAME.fullmatch(path.name)
         with suppress(OSError):
             if match and hashlib.sha256(read_bytes(path, LIMIT)).hexdigest() == match[2]:
@@ -112,21 +111,23 @@ def add(folder: Path, key: str, code: bytes, name: str) -> Path:
 
     The key is hexadecimal digits, the name for `powderdsl cache list`. Raises OSError if it cannot be written.
     """
-    for path in sorted(folder.glob(f"{key}-*")):
+    (home := folder / key[:2]).mkdir(mode=0o700, exist_ok=True)
+    for path in sorted(home.glob(f"{key}-*")):
         path.unlink(missing_ok=True)  # damaged, or from another process that was as fast
     name = re.sub(r"[^\w.+]", "_", name)[:80] or "?"
-    path = folder / f"{key}-{hashlib.sha256(code).hexdigest()}-{name}"
+    path = home / f"{key}-{hashlib.sha256(code).hexdigest()}-{name}"
     with scratch_folder(folder) as scratch:
         (scratch / "code").write_bytes(code)
         os.replace(scratch / "code", path)
-    tidy(folder, keep=path)
+    if key.startswith("0"):  # reading all folders takes as long as some stages
+        tidy(folder, keep=path)
     return path
 
 
 def entries(folder: Path) -> list[CachedFile]:
     """The files in the cache, most recently used first."""
     stored = []
-    for path in sorted(folder.iterdir()):
+    for path in sorted(folder.glob("*/*")):
         with suppress(OSError):
             if match := NAME.fullmatch(path.name):
                 status = path.stat()
@@ -153,15 +154,14 @@ def fused_code(*, remove: bool = False) -> list[CachedFile]:
 
 def tidy(folder: Path, limit: int = LIMIT, keep: Path | None = None) -> None:
     """Remove old leftovers and, beyond `limit` bytes or `MOST` files, the files used longest ago, except `keep`."""
-    stored = entries(folder)
     total = 0
-    for count, entry in enumerate(sorted(stored, key=lambda entry: entry.path != keep)):
+    for count, entry in enumerate(sorted(entries(folder), key=lambda entry: entry.path != keep)):
         total += entry.size
         if (total > limit or count >= MOST) and entry.path != keep:
             _discard(entry.path)
-    for path in sorted({*folder.iterdir()} - {entry.path for entry in stored}):
+    for path in sorted(folder.iterdir()):
         with suppress(OSError):
-            if time.time() - path.lstat().st_mtime > UNUSED:
+            if not HOME.fullmatch(path.name) and time.time() - path.lstat().st_mtime > UNUSED:
                 _discard(path)
 
 

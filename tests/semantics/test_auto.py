@@ -297,7 +297,7 @@ def compiled_natively(rules: Ruleset) -> None:
 def test_a_damaged_cache_is_mended(rules: Ruleset, tmp_path: Path) -> None:
     with building(Building("-O0", tmp_path)):
         compiled_natively(rules)
-        starts = sorted(tmp_path.glob("*.layout"))  # of the width, and of the width compiled last
+        starts = sorted(tmp_path.glob("*/*.layout"))  # of the width, and of the width compiled last
         assert len(starts) == 2
         whole = starts[0].read_bytes()
         for damage in (whole[:40], b"", whole.replace(b"layout", b"lay-by"), b"\xff"):

@@ -46,7 +46,9 @@ def put(folder: Path, key: str, data: bytes, used: float | None = None) -> Path:
 
 
 def names(folder: Path) -> set[str]:
-    return {place.name for place in folder.iterdir()}
+    """The files in the cache, and the other contents of its folder."""
+    homes = [path for path in folder.iterdir() if path.is_dir() and cache.HOME.fullmatch(path.name)]
+    return {path.name for place in (folder, *homes) for path in place.iterdir() if path not in homes}
 
 
 # --- what is stored

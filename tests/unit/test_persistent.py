@@ -46,7 +46,7 @@ def test_a_result_is_made_once_for_each_input_and_version(
 def test_a_damaged_file_is_made_again(folder: Path) -> None:
     calls: list[int] = []
     cache.persistent("stage", "a", counted(calls))
-    (path,) = folder.glob("*-stage")
+    (path,) = folder.glob("*/*-stage")
     path.write_bytes(path.read_bytes()[:-1])
     assert cache.persistent("stage", "a", counted(calls)) == (2,)
     assert cache.persistent("stage", "a", counted(calls)) == (2,)
@@ -68,15 +68,16 @@ def test_quick_work_and_what_cannot_be_pickled_is_not_stored(
     assert cache.persistent("stage", "deep", lambda: deep) is deep
     monkeypatch.setattr(cache, "QUICK", 60.0)
     cache.persistent("stage", "quick", lambda: 1)
-    assert not folder.is_dir() or not any(folder.glob("*-stage"))
+    assert not folder.is_dir() or not any(folder.glob("*/*-stage"))
 
 
-def test_the_folder_stays_small(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_folder_stays_small(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(cache, "MOST", 3)
-    for number in range(5):
-        cache.persistent("stage", str(number), lambda: number)  # noqa: B023
+    for key in ("0a", "1a", "2a", "3a", "00"):
+        cache.add(tmp_path, key, b"code", "stage")
         time.sleep(0.01)
-    assert len(list(folder.iterdir())) == 3
+    keys = [entry.path.name.partition("-")[0] for entry in cache.entries(tmp_path)]
+    assert keys == ["00", "3a", "2a"]
 
 
 def test_a_model_and_its_remarks_are_those_of_the_text(folder: Path, tmp_path: Path) -> None:
