@@ -15,7 +15,7 @@ from powderdsl.envs.tensor_env import TensorEnv
 from powderdsl.system.writing import failure
 from powderdsl.targets.cpp.program import Places
 from powderdsl.targets.cpp.source import known_width, native_source
-from powderdsl.targets.layout import braced, parameters, pieces
+from powderdsl.targets.layout import braced, pieces
 from powderdsl.tasks.compiled import Plan
 from powderdsl.tasks.episodes import Episodes
 
@@ -131,7 +131,7 @@ def _tables(env: TensorEnv, plan: Plan, places: Places, episodes: Episodes) -> I
         cast = "(const u64*)" if name == "masks" else ""
         assignments.append(f"p.pool_{name} = {cast}POOL_{name.upper()};")
     params = env.simulator.parameters(env.params, 1)
-    bits, reals = parameters(torch, params, places.layout.param_planes, places.layout.param_reals, 1)
+    bits, reals = places.layout.parameters(torch, params, 1)
     yield _numbers("PARAMETER_BITS", bits)
     yield _numbers("PARAMETER_VALUES", reals)
     yield from _worlds(env, places, episodes)

@@ -32,15 +32,7 @@ def environment(task: str | Path | Task | TaskProgram, num_envs: int = 1, **how:
     return (MixedEnv if program.is_mixed else CompiledEnv)(program, num_envs, **how)
 
 
-COLUMNS = (
-    "observed",
-    "reward",
-    "terminated",
-    "truncated",
-    "success",
-    "episode_return",
-    "episode_length",
-)
+COLUMNS = ("observed", "reward", "terminated", "truncated", "success", "episode_return", "episode_length")
 """The results of a step, one row per episode: names of `Results`."""
 
 
@@ -304,10 +296,9 @@ class MixedEnv(CompiledEnv):
                 raise ValueError(f"no ruleset {number}: there are {len(self.program.rulesets)}")
             env = CompiledEnv(self.program.under(number), len(rows))
             env.restore(saved["env"])
-            episodes, returned, params = env.episodes, env.returns, env.params
-            assert episodes is not None
+            assert env.episodes is not None
             groups[number] = self._env(number), rows
-            groups[number][0].adopt(episodes, returned, params)
+            self._env(number).adopt(env.episodes, env.returns, env.params)
         members = np.concatenate([rows for _, rows in groups.values()])
         if sorted(members.tolist()) != [*range(self.num_envs)]:
             raise ValueError("the saved worlds are not those of an environment")

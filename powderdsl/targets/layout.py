@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any
 
 from powderdsl.ir.ops import Node, Program, Threshold, Type, nodes_of, plane_name
@@ -26,7 +27,7 @@ class Piece:
         """The piece of an array [B, H, W], or [B, 2, H, W] for a vector."""
         return array if self.component is None else array[:, self.component]
 
-    @property
+    @cached_property
     def planes(self) -> tuple[str, ...]:
         """The slots of its bit planes, lowest first; the slot itself for flags and floats."""
         if self.type.name != "int":
@@ -60,32 +61,6 @@ def limits(xp: Any, values: Any, threshold: Threshold) -> Any:
     return xp.asarray(xp.clip(limit, 0, count), dtype=xp.int64)
 
 
-def parameters(
-    xp: Any,
-    params: Mapping[str, Any],
-    planes: Mapping[tuple[str, Threshold | None, int], int],
-    reals: Mapping[str, int],
-    batch: int,
-    **where: Any,
-) -> tuple[Any, Any]:
-    """Parameters as the bits and floats that compiled code reads: uint8 [n, B], float32 [m, B].
-
-    `xp` is the library of the arrays; `where` is its device argument, if it has one. `planes` numbers the bits of values
-    and thresholds that the code reads, and `reals` the values.
-    """
-    bits = xp.zeros((max(1, len(planes)), batch), dtype=xp.uint8, **where)
-    views: dict[tuple[str, Threshold | None], Any] = {}
-    for (name, threshold, bit), number in planes.items():
-        if (name, threshold) not in views:
-            value = params[name] if threshold is None else limits(xp, params[name], threshold)
-            views[name, threshold] = xp.asarray(value, dtype=xp.int64)
-        bits[number] = (views[name, threshold] >> bit) & 1
-    floats = xp.zeros((max(1, len(reals)), batch), dtype=xp.float32, **where)
-    for name, number in reals.items():
-        floats[number] = xp.asarray(params[name], dtype=xp.float32)
-    return bits, floats
-
-
 @dataclass
 class Layout:
     """The numbers of slots, streams, parameters and fixed planes."""
@@ -105,6 +80,40 @@ class Layout:
         if piece.is_real:
             return self.reals[piece.slot], 0, False
         return self.planes[piece.planes[0]], len(piece.planes), piece.signed
+
+    @cached_property
+    def _bits(self) -> tuple[dict[Threshold | None, dict[str, None]], list[int], list[int]]:
+        """The parameters of each threshold, and of each plane, the number of its parameter there and its bit."""
+        groups: dict[Threshold | None, dict[str, None]] = {}
+        for name, threshold, _ in self.param_planes:
+            groups.setdefault(threshold, {})[name] = None
+        keys = [(name, threshold) for threshold, names in groups.items() for name in names]
+        rows, planes = {key: row for row, key in enumerate(keys)}, self.param_planes
+        return groups, [rows[key[:2]] for key in planes], [bit for *_, bit in planes]
+
+    def parameters(self, xp: Any, params: Mapping[str, Any], batch: int, **where: Any) -> tuple[Any, Any]:
+        """Parameters as the bits and floats that compiled code reads: uint8 [n, B], float32 [m, B].
+
+        `xp` is the library of the arrays; `where` is its device argument, if it has one.
+        """
+
+        def rows_of(names: Iterable[str], dtype: Any) -> Any:
+            return xp.stack(
+                [xp.broadcast_to(xp.asarray(params[name], dtype=dtype), (batch,)) for name in names]
+            )
+
+        groups, rows, places = self._bits
+        bits, floats = (xp.zeros((1, batch), dtype=dtype, **where) for dtype in (xp.uint8, xp.float32))
+        if rows:
+            values = [
+                limits(xp, rows_of(names, xp.float64), threshold) if threshold else rows_of(names, xp.int64)
+                for threshold, names in groups.items()
+            ]
+            numbers = xp.concatenate(values)[xp.asarray(rows, **where)]
+            bits = xp.asarray(numbers >> xp.asarray(places, **where).reshape(-1, 1) & 1, dtype=xp.uint8)
+        if self.param_reals:
+            floats = rows_of(self.param_reals, xp.float32)
+        return bits, floats
 
     def limit(self, draw: Node) -> int:
         """The plane of the highest bit of the parameter that a draw is compared with; lower bits follow."""

@@ -20,7 +20,6 @@ from powderdsl.model.types import Expr
 from powderdsl.simulation.simulator import World
 from powderdsl.targets.cpp.episodes import MODES, OPS, Fresh, Play
 from powderdsl.targets.cpp.program import NativeProgram, PackedState, Places, Views
-from powderdsl.targets.layout import parameters
 from powderdsl.tasks.episodes import Episodes, TaskProgram, params_of
 from powderdsl.tasks.goals import ACTION_WORDS
 from powderdsl.tasks.tensors.actions import Blocks
@@ -360,8 +359,7 @@ class Stepper(Plan):
             for name, value in (params_of(self.episodes, self._overrides) or {}).items():
                 self._params[name].copy_(value)
             own_params = {name: value[rows] for name, value in self._params.items()}
-            layout = self.native.layout
-            bits, floats = parameters(torch, own_params, layout.param_planes, layout.param_reals, len(rows))
+            bits, floats = self.native.layout.parameters(torch, own_params, len(rows))
             self._inputs.planes[:, rows], self._inputs.reals[:, rows] = bits, floats
 
     def fill(self, numbers: Callable[[Tensor, Tensor], Tensor]) -> None:

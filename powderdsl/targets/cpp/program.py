@@ -20,7 +20,7 @@ from powderdsl.system.reading import read_bytes
 from powderdsl.targets.cpp.build import build, current, load_library
 from powderdsl.targets.cpp.source import native_source
 from powderdsl.targets.job import Job, Like, OwnedBatch, like_of, shape_of
-from powderdsl.targets.layout import Layout, Piece, parameters, pieces
+from powderdsl.targets.layout import Layout, Piece, pieces
 
 KEPT_INPUTS = 16
 """The number of parameter mappings whose inputs a program caches."""
@@ -237,10 +237,9 @@ class NativeProgram(Places):
         """The inputs of some parameters, kept for the next call with the same mapping."""
         if (known := self._inputs.get(id(params))) is not None:
             return known
-        layout = self.layout
-        bits, floats = parameters(torch, params, layout.param_planes, layout.param_reals, batch)
         if len(self._inputs) >= KEPT_INPUTS:
             self._inputs = {}  # not cleared: another thread may be reading it
+        bits, floats = self.layout.parameters(torch, params, batch)
         self._inputs[id(params)] = inputs = ParameterArrays(params, bits, floats)
         return inputs
 

@@ -24,7 +24,7 @@ from powderdsl.ir.ops import Program
 from powderdsl.system import cache as native_cache
 from powderdsl.targets.cuda.source import KernelSource, cuda_source
 from powderdsl.targets.job import Job, Like, PackedArrays, Runnable, like_of, shape_of, unavailable
-from powderdsl.targets.layout import parameters, pieces
+from powderdsl.targets.layout import pieces
 from powderdsl.targets.tensor_kind import pack
 from powderdsl.targets.torch.program import packed_program
 
@@ -232,8 +232,7 @@ class CudaProgram:
             after = self._pack(state)
         device, (batch, height, width) = after.planes.device, after.like["element"][1]
         source, launch = self.kernel(height, width)
-        views = source.layout.param_planes, source.layout.param_reals
-        flags, numbers = parameters(torch, job.params, *views, batch, device=device)
+        flags, numbers = source.layout.parameters(torch, job.params, batch, device=device)
         blocks = -(-batch // source.group)
         scratch = torch.empty(max(1, blocks * source.scratch // 4), dtype=torch.int32, device=device)
         clock = [part.contiguous() for part in (job.clock.seed, job.clock.world, job.clock.step)]

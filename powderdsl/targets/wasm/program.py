@@ -16,7 +16,7 @@ from powderdsl.ir.text import structure
 from powderdsl.system.cache import Memo, persistent
 from powderdsl.targets.array_kind import Array, ArrayKind
 from powderdsl.targets.job import Job, Like, OwnedBatch, like_of, shape_of
-from powderdsl.targets.layout import layout_of, parameters, pieces
+from powderdsl.targets.layout import layout_of, pieces
 from powderdsl.targets.wasm.host import GROUPS, HEADER, Compiled, aligned, numbers_of, this_host
 
 ROOM = 1 << 30
@@ -161,7 +161,7 @@ class Instance:
     def input_bytes(self, params: Mapping[str, Array], worlds: int) -> bytes:
         """The bytes after the clocks: bits of parameters, and their values at a multiple of 16 bytes."""
         layout = self.layout
-        bits, reals = parameters(self.kind.xp, params, layout.param_planes, layout.param_reals, worlds)
+        bits, reals = layout.parameters(self.kind.xp, params, worlds)
         head = bytes(self.kind.bytes_of(bits))[: worlds * len(layout.param_planes)]
         values = bytes(self.kind.bytes_of(reals))[: 4 * worlds * len(layout.param_reals)]
         return bytes(-24 * worlds & 15) + head.ljust(aligned(len(head)), b"\0") + values
