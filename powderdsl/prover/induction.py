@@ -57,7 +57,7 @@ class Transition:
     before: World
     after: World
     ranges: Ranges = field(default_factory=dict)
-    evaluation: Formulas | None = None
+    formulas: Formulas | None = None
     moves: tuple[tuple[Node, Offset], ...] = ()
     """Flags of cells that exchange something with a neighbor, and the offset of that neighbor."""
     only_moves: bool | None = None
@@ -65,7 +65,7 @@ class Transition:
     model: Model | None = None
     """The answer to the last question, if any."""
     _facts: dict[object, list[Literal]] = field(default_factory=dict)
-    _evaluations: dict[int, Formulas] = field(default_factory=dict)
+    _formulas: dict[int, Formulas] = field(default_factory=dict)
 
     @cached_property
     def questions(self) -> Questions:
@@ -73,8 +73,8 @@ class Transition:
 
     def condition(self, node: Node, world: World, cell: Cell) -> Literal:
         """A condition at a cell of a world."""
-        evaluation = self._evaluations.setdefault(id(world), Formulas(world, self.symbols))
-        return evaluation.value(node, *cell)
+        formulas = self._formulas.setdefault(id(world), Formulas(world, self.symbols))
+        return formulas.value(node, *cell)
 
     def keeps(self, law: Law, given: Laws = ()) -> bool:
         """Return whether the law holds in a cell afterwards if it held in all cells before. Raises OutOfWork,
@@ -193,21 +193,21 @@ class Prover:
         pass_, ranges = self.planes[number], self.ranges[number + cut]
         state, known = dict[str, Node](), dict[Node, tuple[str, str]]()
         row = self.start.symbols.layouts["element"]
-        evaluation = Formulas(begin := Before(symbols := self._symbols(MAX_WHOLE)), symbols)
+        formulas = Formulas(begin := Before(symbols := self._symbols(MAX_WHOLE)), symbols)
         for place, substep in enumerate(pass_.substeps):
             elements = [(plane, node) for plane, node in substep.writes if plane in row.planes]
             moves = tuple(_moves(elements, known))
             if cut:
                 begin = Before(symbols := self._symbols(MAX_WHOLE))
-                evaluation = Formulas(begin, symbols)
-                evaluation.cut = dict(known)
-            before = evaluation.after(state.items())
+                formulas = Formulas(begin, symbols)
+                formulas.cut = dict(known)
+            before = formulas.after(state.items())
             state |= dict(substep.writes)
             ends = pass_.outputs if place == len(pass_.substeps) - 1 else ()
-            after = evaluation.after([*state.items(), *ends])
+            after = formulas.after([*state.items(), *ends])
             starts = (begin, before) if cut else (begin,)
             name = f"{pass_.name}.{place}" if len(pass_.substeps) > 1 else pass_.name
-            transitions.append(Transition(name, symbols, starts, before, after, ranges, evaluation, moves))
+            transitions.append(Transition(name, symbols, starts, before, after, ranges, formulas, moves))
             for plane, node in substep.writes:
                 if node.op not in ("input", "const"):
                     known.setdefault(node, (f"{place}", plane))
@@ -385,8 +385,8 @@ class Prover:
         single cell breaks the rule, the sum does not break it.
         """
         net = transition.symbols.net
-        assert transition.evaluation is not None
-        value, matched, broken = transition.evaluation.value, list[Literal](), list[Literal]()
+        assert transition.formulas is not None
+        value, matched, broken = transition.formulas.value, list[Literal](), list[Literal]()
         for node, (dy, dx) in transition.moves:
             forth = net.and_(value(node, *HERE), differ(HERE, (dy, dx)))
             back = net.and_(value(node, -dy, -dx), differ((-dy, -dx), HERE))

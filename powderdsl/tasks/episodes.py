@@ -280,9 +280,9 @@ class TaskProgram:
         action = {"taken": acted, **done}
         if "left" in self._asked:
             action["left"] = agent.actions - acted
-        facts = ScalarInputs(self.measure_numbers, now, episodes.start, episodes.before, action)
+        inputs = ScalarInputs(self.measure_numbers, now, episodes.start, episodes.before, action)
         success, failed = (
-            torch.zeros_like(last) if scalar is None else scalar_value(scalar, facts) != 0
+            torch.zeros_like(last) if scalar is None else scalar_value(scalar, inputs) != 0
             for scalar in (goal.success, goal.failure)
         )
         over = last
@@ -291,9 +291,9 @@ class TaskProgram:
         if goal.each is None:
             reward = torch.zeros_like(acted, dtype=torch.float64)
         else:
-            reward = scalar_value(goal.each, facts)
+            reward = scalar_value(goal.each, inputs)
         if goal.final is not None:
-            final = scalar_value(goal.final, facts)
+            final = scalar_value(goal.final, inputs)
             reward = reward + torch.where(over, final, torch.zeros_like(final))
         after = replace(episodes, world=world, acted=acted, failed=failed, before=now)
         return after, reward.float(), success, over

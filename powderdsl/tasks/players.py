@@ -64,13 +64,13 @@ class ExpertPlayer:
         places = episodes.regions, episodes.targets
         now = self._meter.take(episodes.world, *places, episodes.params, self._meter.masks(*places))
         left = self.program.task.agent.actions - episodes.acted
-        facts = ScalarInputs(self._numbers, now, now, now, {"taken": episodes.acted, "left": left})
+        inputs = ScalarInputs(self._numbers, now, now, now, {"taken": episodes.acted, "left": left})
         actions = torch.zeros(len(episodes), 5, dtype=torch.int64, device=now.device)
         waiting = torch.ones(len(episodes), dtype=torch.bool, device=now.device)
         for number, move in enumerate(self.expert.moves):
             applies = waiting.clone()
             if move.condition is not None:
-                applies &= scalar_value(move.condition, facts) != 0
+                applies &= scalar_value(move.condition, inputs) != 0
             if not bool(applies.any()):
                 continue
             targets, cells = self._action(move, episodes)

@@ -321,25 +321,25 @@ class ScalarInputs:
     action: Mapping[str, Tensor]
 
 
-def scalar_value(scalar: Expr, facts: ScalarInputs) -> Tensor:
+def scalar_value(scalar: Expr, inputs: ScalarInputs) -> Tensor:
     """The value of an expression in each world: float64 [B]; conditions are 0 or 1."""
-    value = _value(scalar, facts)
-    return value if value.ndim else value.expand(len(facts.now)).clone()
+    value = _value(scalar, inputs)
+    return value if value.ndim else value.expand(len(inputs.now)).clone()
 
 
-def _value(scalar: Expr, facts: ScalarInputs) -> Tensor:
+def _value(scalar: Expr, inputs: ScalarInputs) -> Tensor:
     """The result of `scalar_value`, or float64 [] if all worlds have the same value."""
     match scalar.op:
         case "const":
-            return torch.full((), float(scalar.value), dtype=torch.float64, device=facts.now.device)
+            return torch.full((), float(scalar.value), dtype=torch.float64, device=inputs.now.device)
         case "measure":
-            return facts.now[:, facts.measures[scalar.value]]
+            return inputs.now[:, inputs.measures[scalar.value]]
         case "action":
-            return facts.action[scalar.value].double()
+            return inputs.action[scalar.value].double()
         case "start" | "before":
-            then = facts.start if scalar.op == "start" else facts.before
-            return _value(scalar.args[0], replace(facts, now=then))
-    args = [_value(arg, facts) for arg in scalar.args]
+            then = inputs.start if scalar.op == "start" else inputs.before
+            return _value(scalar.args[0], replace(inputs, now=then))
+    args = [_value(arg, inputs) for arg in scalar.args]
     value = _VALUES[scalar.op](*args)
     if scalar.op not in ("div", "quotient", "mod") or (scalar.args[1].op == "const" and scalar.args[1].value):
         return value
