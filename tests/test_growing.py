@@ -83,7 +83,7 @@ far = build.derive("distance", n, element)
 assert far.type == integer(0, 12), far.type
 new = build.derive("min", build.derive("add", far, folded), build.integer(12))
 real = build.derive("distance", x, build.derive("mul", x, build.real(3.0)))
-writes = ("n", new), ("x", build.derive("settle", real, attr=(-50.0, 50.0)))
+writes = ("n", new), ("x", build.derive("clamp", real, attr=(-50.0, 50.0)))
 program = Program("grown", slots, (), (), (PassGraph("p", "p", (SubstepGraph("", "", writes, ()),), writes),))
 program = run_passes(program)
 

@@ -85,7 +85,7 @@ _ROWS = (
     ("PD502", "write-conflict"),
     ("PD503", "rule-never-fires", _WARNING),
     ("PD505", "empty-set", _NOTE),
-    ("PD506", "rule-asleep", _NOTE),
+    ("PD506", "inactive-rule", _NOTE),
     ("PD507", "unused-definition", _WARNING),
     ("PD508", "expansion-too-large"),
     ("PD509", "rule-does-nothing", _WARNING),

@@ -409,7 +409,7 @@ class _PassLowering:
             if slot.name not in self.scratch and last is not before[part.name]:
                 limits = (float(slot.kind.lo), float(slot.kind.hi))
                 outputs.append(
-                    (part.name, build.derive("settle", last, attr=limits) if slot.is_real else last)
+                    (part.name, build.derive("clamp", last, attr=limits) if slot.is_real else last)
                 )
         return PassGraph(self.pass_.name, self.pass_.pack, substeps, tuple(outputs))
 

@@ -139,7 +139,7 @@ class Op:
         return single(result) if isinstance(result, float) else result
 
 
-def _settle(limits: tuple[float, float], a: float) -> float:
+def _clamp(limits: tuple[float, float], a: float) -> float:
     result = smaller(larger(a, single(limits[0])), single(limits[1]))
     return result if abs(result) >= SNAP else 0.0  # NaN is not ≥ SNAP
 
@@ -205,7 +205,7 @@ _TABLE = (
     Op("max", ("=", "="), "=", "", "", lambda a, b: (max(a.lo, b.lo), max(a.hi, b.hi)), larger, commutative=True),
     Op("sqrt", ("real",), "real", evaluate=square_root),
     Op("to_real", ("?",), "real"),
-    Op("settle", ("real",), "real", "(low, high)", "NaN → 0, clamped to the bounds, smaller than SNAP → 0", evaluate=_settle),
+    Op("clamp", ("real",), "real", "(low, high)", "NaN → 0, clamped to the bounds, smaller than SNAP → 0", evaluate=_clamp),
     # choices and movements
     Op("select", ("flag", "=", "="), "=", "", "second argument where the first is true, else the third",
        lambda condition, yes, no: _union(yes, no), gates=3),

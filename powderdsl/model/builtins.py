@@ -54,7 +54,7 @@ MAX_RADIUS = 15
 
 @lru_cache(maxsize=256)
 def shaped_kernel(shape: str, radius: int, name: str = "", wrap: bool = False) -> Kernel:
-    """The kernel of a shape and radius. Its name is as it is written, `box(5)`, unless it has one of its own."""
+    """The kernel of a shape and radius. It is named as written, `box(5)`, unless the file names it."""
     covers, reach = KERNEL_SHAPES[shape], range(-radius, radius + 1)
     weights = tuple((dy, dx, 1) for dy in reach for dx in reach if covers(dy, dx, radius))
     return Kernel(name or f"{shape}({radius})", weights, wrap)

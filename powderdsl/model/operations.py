@@ -2,7 +2,7 @@
 
 The words of functions, their arguments' kinds, the folding of constants, ranges of integers, the search of
 `logic.satisfy`, the printed model, the lowering, random rules and the table in `docs/language/expressions.md` follow from it. The
-oracle, `model.reference`, has a table of its own.
+oracle, `model.reference`, has its own table.
 """
 
 from __future__ import annotations

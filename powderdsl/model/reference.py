@@ -394,7 +394,7 @@ def masks_of(substep: Substep, at: Context) -> dict[int, Array]:
     masks = {id(rule): evaluate(rule.mask, at) for rule in substep.rules}
     if substep.policy in ("drop_both", "first_wins"):
         claims = [rule for rule in substep.rules if not isinstance(rule, Assign)]
-        _settle_claims(substep.policy, claims, masks)
+        _resolve_claims(substep.policy, claims, masks)
     return masks
 
 
@@ -428,7 +428,7 @@ def _apply_write(assign: Assign, kind: Kind, old: Array, value: Array) -> Array:
     return np.clip(new, int(kind.lo), int(kind.hi)) if kind.name == "int" else new
 
 
-def _settle_claims(policy: str, claims: list[Any], masks: dict[int, Array]) -> None:
+def _resolve_claims(policy: str, claims: list[Any], masks: dict[int, Array]) -> None:
     """Apply a conflict policy: narrow the masks so that no two rules claim one cell."""
     wanted = {id(rule): masks[id(rule)] for rule in claims}
 
@@ -480,7 +480,7 @@ def run_pass(pass_: Pass, at: Context, table: Mapping[str, Slot]) -> State:
     after = clamp({name: value for name, value in at.state.items() if name in table}, table)
     if at.watch is not None:
         for name, slot in table.items():
-            at.watch.wrote(Change("settle", slot), at.state[name], after[name])
+            at.watch.wrote(Change("clamp", slot), at.state[name], after[name])
     return after
 
 

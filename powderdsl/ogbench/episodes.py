@@ -195,7 +195,7 @@ class EpisodeDraws:
 
 
 class LegacyDraws(EpisodeDraws):
-    """OGBench's order of draws: `numpy.random.RandomState` of its own for each environment, instead of the global one."""
+    """OGBench's order of draws: each environment has its own `numpy.random.RandomState`, instead of the global one."""
 
     fixes_goals = False
 

@@ -145,8 +145,8 @@ class BinPolicy(ActorCriticPolicy):
         places = torch.meshgrid(*(torch.linspace(-1, 1, side) for side in bins), indexing="ij")
         self.register_buffer("places", torch.stack(places))
         self.see, self.trunk = see, Trunk(see.channels + 2, width)
-        deeds, idle = divmod(form.nvec[0], bins[0] * bins[1])
-        self.scores = nn.Conv2d(width, deeds, 1)
+        choices, idle = divmod(form.nvec[0], bins[0] * bins[1])
+        self.scores = nn.Conv2d(width, choices, 1)
         self.idle = nn.Linear(width, 1) if idle else None  # doing nothing has no location
         self.judge = nn.Sequential(
             nn.Conv2d(see.channels + 2, width, 3, 2, 1),

@@ -419,7 +419,7 @@ class _Cutter:
 
     def cell_needs(self, node: Node) -> list[Node]:
         """The flags, then the floats, that a loop over cells reads."""
-        in_place = node.op == "settle" and match_slot_choices(node, self.input_slots)
+        in_place = node.op == "clamp" and match_slot_choices(node, self.input_slots)
         needs: dict[Node, None] = {}
         stack = [node]
         for top in taken(stack):

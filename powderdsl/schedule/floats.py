@@ -47,7 +47,7 @@ def inline_floats(schedule: Schedule) -> Schedule:
     outs: dict[Node, Out] = {}
     outputs = []
     for slot, value in schedule.outputs:
-        if value.op == "settle" and slot in slots and _only_moves(value.args[0], slots[slot].name):
+        if value.op == "clamp" and slot in slots and _only_moves(value.args[0], slots[slot].name):
             value = value.args[0]
         if value.type == REAL and value.op != "load":
             out = outs.setdefault(value, Out(namer.var(REAL), value))
@@ -161,9 +161,9 @@ def _conjunctions(node: Node, facts: Facts) -> Iterator[tuple[Node, Facts]]:
 
 def match_slot_choices(value: Node, names: Container[str]) -> tuple[Node, list[Node]] | None:
     """Match choices on a clamped slot: its old value, and the masks without which it keeps that value."""
-    if value.op not in ("settle", "select"):
+    if value.op not in ("clamp", "select"):
         return None
-    chain, node = choices(value.args[0] if value.op == "settle" else value)
+    chain, node = choices(value.args[0] if value.op == "clamp" else value)
     masks = [choice.args[0] for choice in chain]
     matches = node.op == "load" and node.attr in names and all(mask.op != "param" for mask in masks)
     return (node, masks) if matches else None

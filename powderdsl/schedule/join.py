@@ -41,7 +41,7 @@ from powderdsl.schedule.types import (
 def narrow(schedule: Schedule) -> Schedule:
     """Add a region, and the values outside it, to loops over cells.
 
-    `v' = settle(m ? a : v)`, where v was clamped → over `m`, else `v`; `w = 0.1 < v*v` → over `live(v)`, else 0.
+    `v' = clamp(m ? a : v)`, where v was clamped → over `m`, else `v`; `w = 0.1 < v*v` → over `live(v)`, else 0.
     """
     schedule = _mask_fields(schedule)
     inputs = {slot: var.name for slot, var in schedule.inputs}

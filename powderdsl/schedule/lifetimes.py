@@ -153,7 +153,7 @@ def _overwrite_fields(sweeps: Sweeps, after: set[str]) -> Sweeps:
 def swap_fields(schedule: Schedule) -> Schedule:
     """Replace loops over cells that exchange values of fields, by the movers of a swap of planes, by swaps of fields.
 
-    `swap by m [+1,+0]: …`, `b = settle(m ? a[1,0] : (m[-1,0] ? a[-1,0] : a))` → `swap by m [+1,+0]: b = a`. Moved values of
+    `swap by m [+1,+0]: …`, `b = clamp(m ? a[1,0] : (m[-1,0] ? a[-1,0] : a))` → `swap by m [+1,+0]: b = a`. Moved values of
     a slot stay within its bounds. If some become zero afterwards, a loop over their rows follows.
     """
     moves = [statement for statement in flat(schedule.body) if isinstance(statement, Move)]
@@ -176,7 +176,7 @@ def swap_fields(schedule: Schedule) -> Schedule:
         planes, outs = [], []
         for out, (_, old) in zip(loop.outs, filter(None, swaps), strict=True):
             slot = clamped.get(old.attr)
-            if out.value.op == "settle" and (slot is None or slots.get(out.var.name) != slot):
+            if out.value.op == "clamp" and (slot is None or slots.get(out.var.name) != slot):
                 return [loop]
             moved = namer.var(REAL) if fresh else out.var
             if slot is not None:
@@ -204,7 +204,7 @@ def _match_swap(
 
     Choices on movers and on targets may come in either order: no cell is both.
     """
-    value = value.args[0] if value.op == "settle" else value
+    value = value.args[0] if value.op == "clamp" else value
     fresh: tuple[Node, ...] = ()
     while value.op == "select" and value.args[0].op == "load" and is_zero(value.args[1]):
         fresh, value = (value.args[0], *fresh), value.args[2]

@@ -50,7 +50,7 @@ HERE: Offset = (0, 0)
 
 _WITHOUT_RULE = {
     "limit": "no rule: cells of this element keep the field's default",
-    "settle": "no rule: at the end of a pass, floats are clamped to their range and tiny ones become zero",
+    "clamp": "no rule: at the end of a pass, floats are clamped to their range and tiny ones become zero",
     "reset": "no rule: the field starts each step at its default",
 }
 """Writes without a rule, by kind. Other kinds: ``assign``, ``effect``, ``become``, ``leave``, ``arrive``."""

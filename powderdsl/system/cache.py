@@ -72,7 +72,7 @@ def persistent(name: str, inputs: str | Callable[[], str], make: Callable[[], T]
     Exceptions and quick results are not stored. A cache that cannot be read or written only costs time.
 
     Args:
-        name: what the result is; each stage has names of its own.
+        name: what the result is; each stage has its own names.
         inputs: a text that determines the result of the stage, or a function that returns it, if that takes long.
         make: returns the result, which can be pickled.
     """

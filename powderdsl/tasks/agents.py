@@ -244,7 +244,7 @@ class _Move:
         # A move has no access to earlier values or the last action.
         parts = [part for part in parts_of(condition) if part.value not in ("taken", "left")]
         if any(part.op in ("start", "before", "action") for part in parts):
-            message, label = "a move sees the world as it is now", "earlier values are not available here"
+            message, label = "a move sees the current world", "earlier values are not available here"
             helps = ["use `count(…)`, `share(…)`, `taken` or `left`"]
             self.reader.reporter.error("PD406", message, syntax.span, label, helps=helps)
             return None

@@ -80,8 +80,8 @@ class GoalChecker:
             return self.scalar(syntax) if check is None else check()
         except Poisoned:
             return None
-        except Unresolved as asleep:
-            self.typer.fail("PD301", f"`{asleep.name}` is not loaded", syntax.span, "depends on it")
+        except Unresolved as missing:
+            self.typer.fail("PD301", f"`{missing.name}` is not loaded", syntax.span, "depends on it")
             return None
 
     # Arithmetic on numbers of the whole world

@@ -221,7 +221,7 @@ def _node(node: Node, args: list[Array], world: World) -> Any:
             return ~args[0]
         case "select":
             return np.where(*args)
-        case "settle":
+        case "clamp":
             cut = np.clip(np.where(np.isnan(args[0]), 0, args[0]), *map(np.float32, attr))
             return np.where(np.abs(cut) < SNAP, 0, cut)
         case "swap" | "arrive" if node.type == FLAG:

@@ -30,7 +30,7 @@ _FLOATS = {
     "min": "smaller({0}, {1})",
     "max": "larger({0}, {1})",
     "sqrt": "root({0})",
-    "settle": "settle({0}, {1}, {2}, SNAP)",
+    "clamp": "clamped({0}, {1}, {2}, SNAP)",
 }
 """The expression of each operation on floats. Arguments are numbered first, then the attribute's numbers."""
 

@@ -215,7 +215,7 @@ ALWAYS F divide_by(F x, float d, float inverse) {
 }
 ALWAYS F smaller(F a, F b) { return choose(a < b, a, choose(a != a, a, b)); }
 ALWAYS F larger(F a, F b) { return choose(a > b, a, choose(a != a, a, b)); }
-ALWAYS F settle(F x, float lo, float hi, float snap) {
+ALWAYS F clamped(F x, float lo, float hi, float snap) {
 #if VECTOR == 64
   const __mmask16 some = _mm512_cmp_ps_mask((__m512)magnitude(x), _mm512_set1_ps(snap), _CMP_GE_OQ);  // not for a NaN
   return (F)_mm512_maskz_max_ps(some, _mm512_min_ps((__m512)x, _mm512_set1_ps(hi)), _mm512_set1_ps(lo));

@@ -174,7 +174,7 @@ OUTLINE float draw_cell(int stream, int l, int y, int x, int bits) {
 DEVICE float divide(float a, float b) { return b == 0 ? 0.0f : a / b; }
 DEVICE float smaller(float a, float b) { return a < b ? a : a != a ? a : b; }
 DEVICE float larger(float a, float b) { return a > b ? a : a != a ? a : b; }
-DEVICE float settle(float x, float lo, float hi) {
+DEVICE float clamped(float x, float lo, float hi) {
   x = x == x ? x : 0.0f;
   x = x < lo ? lo : x;
   x = x > hi ? hi : x;

@@ -22,7 +22,7 @@ _FLOATS = {
     "min": "smaller({0}, {1})",
     "max": "larger({0}, {1})",
     "sqrt": "ROOT({0})",
-    "settle": "settle({0}, {1}, {2})",
+    "clamp": "clamped({0}, {1}, {2})",
 }
 """The expression of each operation on floats. Arguments are numbered first, then the attribute's numbers."""
 

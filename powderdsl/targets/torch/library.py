@@ -288,7 +288,7 @@ class Portable:
         """The square root, rounded correctly, which not every device does for float32."""
         return torch.sqrt(value.double()).float()
 
-    def settle(self, value: Tensor, low: float, high: float) -> Tensor:
+    def clamp(self, value: Tensor, low: float, high: float) -> Tensor:
         """No NaN, within bounds, nothing smaller than `SNAP`."""
         value = torch.where(value == value, value, 0.0).clamp(low, high)
         return torch.where(value.abs() < SNAP, 0.0, value)
@@ -412,7 +412,7 @@ class Eager(Portable):
             # Rounded correctly, as torch does only for float64.
             return torch.from_numpy(np.sqrt(value.numpy()))
 
-    def settle(self, value: Tensor, low: float, high: float) -> Tensor:
+    def clamp(self, value: Tensor, low: float, high: float) -> Tensor:
         value = value.clamp(low, high).nan_to_num_(nan=0.0, posinf=high, neginf=low)
         return torch.nn.functional.hardshrink(value, _BELOW_SNAP)
 

@@ -304,8 +304,8 @@ class _Writer:
                 return text, args
             rolled = self.name(text, "f", args)
             return f"k.choose({self.input('inside_mask', dy, dx)}, {rolled}, 0.0)", [rolled]
-        if node.op == "settle":
-            return f"k.settle({args[0]}, {node.attr[0]!r}, {node.attr[1]!r})", args
+        if node.op == "clamp":
+            return f"k.clamp({args[0]}, {node.attr[0]!r}, {node.attr[1]!r})", args
         return _REALS[node.op].format(*args), args
 
     def choice(self, flag: Node, yes: Node, no: Node) -> tuple[str, list[str]]:

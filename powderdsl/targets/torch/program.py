@@ -161,7 +161,7 @@ class Kernels:
         """A parameter as a chance [B, 1, 1]: the number of possible draws below it, or not above it."""
         return limits(torch, self.params[name], Threshold(bits, strict))[:, None, None]
 
-    def settle(self, x: Tensor, low: float, high: float) -> Tensor:
+    def clamp(self, x: Tensor, low: float, high: float) -> Tensor:
         """No NaN, within bounds, nothing smaller than `snap`."""
         x = x.masked_fill(x.isnan(), 0).clamp(low, high)
         return x.masked_fill(x.abs() < self.snap, 0)

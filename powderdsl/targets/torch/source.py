@@ -105,7 +105,7 @@ _KERNELS: dict[str, str | Callable[..., str]] = {
     # torch's float32 square root is not always rounded correctly on CPUs; from float64 it is.
     "sqrt": "torch.sqrt({0}.double()).float()",
     "to_real": "{0}.float()",
-    "settle": "k.settle({0}, {attr[0]!r}, {attr[1]!r})",
+    "clamp": "k.clamp({0}, {attr[0]!r}, {attr[1]!r})",
     "select": _select,
     "swap": _swap,
     "arrive": _arrive,

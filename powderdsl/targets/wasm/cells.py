@@ -40,7 +40,7 @@ def _best(instruction: str, a: Value, b: Value) -> Value:
     return choose(op("f32x4.ne", a, a), a, op(instruction, b, a))
 
 
-def _settled(value: Value, low: float, high: float) -> Value:
+def _clamped(value: Value, low: float, high: float) -> Value:
     """A number that may be stored: clamped, and 0 for NaN and for tiny values."""
     x = body.let(value)
     x &= op("f32x4.eq", x, x)
@@ -61,7 +61,7 @@ _FLOATS: dict[str, str | Callable[..., Value]] = {
     "min": partial(_best, "f32x4.pmin"),
     "max": partial(_best, "f32x4.pmax"),
     "sqrt": "f32x4.sqrt",
-    "settle": _settled,
+    "clamp": _clamped,
 }
 """Each operation on floats: its instruction, or a function of the arguments and the attribute's numbers."""
 

@@ -6,7 +6,7 @@ grid, and values are clamped to the range of the rules, so that a host cannot ma
     cells() → address                 the ids, a byte a cell, row by row
     begin(seed)                       the cells there become a new world, at step 0, with the usual values of fields
     step(count)
-    show() → address                  the ids of the world as it is, at the same address
+    show() → address                  the ids of the current world, at the same address
     field(number) → address           the values of a field, [components, rows, columns] in its type
     take(number)                      the values there, where they can differ from the usual ones, become those of the field
     paint(element, top, bottom, left, right)                    a box of fresh cells

@@ -88,7 +88,7 @@ class Start:
         fields: Mapping[str, Array] | None = None,
         params: Mapping[str, Array] | None = None,
     ) -> Start:
-        """Worlds [B, H, W], or one world [H, W], that share a seed: each has an index of its own."""
+        """Worlds [B, H, W], or one world [H, W], that share a seed: each has its own index."""
         grid = np.asarray(ids, np.uint8)
         grid = grid[None] if grid.ndim == 2 else grid
         batch = len(grid)
@@ -157,14 +157,14 @@ def fresh(ruleset: Ruleset, slot: Slot, ids: Array) -> Array:
 
 
 def holding(ruleset: Ruleset, slot: Slot, ids: Array) -> Array:
-    """bool, as `ids`: the cells whose element may hold a value of its own in a slot."""
+    """bool, as `ids`: the cells whose element may have its own value in a slot."""
     prop = ruleset.property(slot.name)
     holders = slot.of if prop is None else prop.stored
     return np.ones(ids.shape, bool) if holders is None else np.isin(ids, sorted(holders))
 
 
 def clamped_to_holders(ruleset: Ruleset, slot: Slot, values: Array, ids: Array) -> Array:
-    """A slot's values, with those of fresh cells where the element cannot hold one of its own."""
+    """A slot's values, with those of fresh cells where the element cannot have another."""
     may = holding(ruleset, slot, ids)
     if may.all():
         return values

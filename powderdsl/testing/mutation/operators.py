@@ -94,7 +94,7 @@ def exchange_texts(operator: str, first: Span, second: Span) -> Change:
     return replace_text(operator, first.to(second), f"{second.text}{between}{first.text}")
 
 
-# Cutting entries out of located YAML, and putting some in: the rest of the file stays as it is
+# Cutting entries out of located YAML, and putting some in: the rest of the file is unchanged
 
 
 def removed(operator: str, path: Path) -> Change:
@@ -123,7 +123,7 @@ def without(operator: str, items: list[Span], number: int) -> Change:
 
 
 def inserted(operator: str, path: Path, entry: str) -> Change:
-    """A new entry after one of a mapping's, written as the mapping is: with a comma, or on a line of its own."""
+    """A new entry after one of a mapping's, written as the mapping is: with a comma, or on its own line."""
     node, number = path[-1]
     assert isinstance(node, yaml_tree.Mapping)
     end = entry_spans(node)[number].end

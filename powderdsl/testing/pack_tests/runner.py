@@ -245,8 +245,8 @@ def _wanted(rules: Ruleset, kind: Kind, cell: Cell, fresh: NDArray[Any]) -> str:
     )
 
 
-# Chances, held against counts: many copies of a world, each with luck of its own. A count is judged by Chernoff's bound,
-# which needs no table and holds for any number of trials: that n trials of a chance p come out at a share q or farther
+# Chances, compared with counts: many copies of a world, each with its own random numbers. Chernoff's bound judges a count.
+# It needs no table and holds for any number of trials: that n trials of a chance p come out at a share q or farther
 # away has a probability of at most exp(−n·D(q‖p)) on each side, where D is the divergence of the two. A correct rule
 # fails with a probability below `ERROR_RATE`; seeds are fixed, so that a test which passes once passes always.
 
@@ -299,7 +299,7 @@ def trials_for(chance: float) -> int:
 def chance_problem(start: World, example: Example, seed: int) -> str:
     """A sentence about the first claim of a test that the counts contradict; empty if there is none.
 
-    All copies of the one world `start` have the same seed, and each an index of its own.
+    All copies of the one world `start` have the same seed, and each its own index.
     """
     steps, claims = example.steps, example.often
     chosen = [
@@ -315,7 +315,7 @@ def chance_problem(start: World, example: Example, seed: int) -> str:
     hits = [0] * len(chosen)
     chunk, put = max(1, CHUNK // cells_of_one), start.sim.kind.put
     for first in range(0, copies, chunk):
-        index = [*range(first, min(first + chunk, copies))]  # by which each copy has luck of its own
+        index = [*range(first, min(first + chunk, copies))]  # so that each copy has its own random numbers
         world = start.select(put([0] * len(index), "int64"))
         world = replace(world, index=put(index, "int64"), seed=put([seed] * len(index), "int64"))
         world = world.sim.step(world, steps=steps, params=dict(example.params))

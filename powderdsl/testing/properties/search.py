@@ -214,7 +214,7 @@ class InvariantSearch:
 
 
 def counterexample(claim: Tested, runner: Runs, sample: Start, steps: int) -> Counterexample:
-    """A world that breaks a claim, as it is, and the rules that did it."""
+    """A world that breaks a claim, unreduced, and the rules that broke it."""
     cell = breaks(claim, runner, sample, steps).cell[0]
     states = runner.states(sample, steps)
     names = ("element", *shown_fields(runner.ruleset))
