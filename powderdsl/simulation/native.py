@@ -18,7 +18,7 @@ import warnings
 from collections.abc import Callable, Mapping
 from contextvars import copy_context
 from dataclasses import replace
-from functools import cache, partial
+from functools import cache, cached_property, partial
 from math import prod
 
 import torch
@@ -54,17 +54,6 @@ SLICE = 0.25
 """Seconds on the first backend between two checks for native code."""
 
 
-def start_key(ruleset: Ruleset, width: int | None = None) -> str:
-    """The cache's key for the native code of a ruleset; without `width`, for the code compiled last.
-
-    Raises NoCompiler if there is no compiler.
-    """
-    compiler = find_compiler()
-    params = tuple(replace(param, default=0, about="") for param in ruleset.params)
-    model = fingerprint(replace(ruleset, params=params))
-    return cache_key(f"{model}{code_hash()} {width}", compiler, flags_for(compiler, current().level))
-
-
 class ByWidth:
     """Native code for each width of grids (`known_width`), made for the first grid of that width.
 
@@ -92,7 +81,7 @@ class ByWidth:
         self._programs: dict[int, Runnable] = {}
         self._latest: Runnable | None = None
         try:
-            code = recall(start_key(ruleset))
+            code = recall(self._key())
         except NoCompiler as error:
             if first is None:
                 raise _refusal(error) from None
@@ -116,9 +105,21 @@ class ByWidth:
                 raise _refusal(error) from None
             return self._programs.setdefault(width, program)
 
+    @cached_property
+    def _model(self) -> str:
+        params = tuple(replace(param, default=0, about="") for param in self._ruleset.params)
+        return fingerprint(replace(self._ruleset, params=params))
+
+    def _key(self, width: int | None = None) -> str:
+        """The cache's key for native code; without `width`, for the code compiled last. Raises NoCompiler."""
+        compiler = find_compiler()
+        return cache_key(
+            f"{self._model}{code_hash()} {width}", compiler, flags_for(compiler, current().level)
+        )
+
     def _recall(self, width: int) -> Runnable | None:
         """Cached native code, or None. Raises NoCompiler."""
-        code = recall(start_key(self._ruleset, width))
+        code = recall(self._key(width))
         return None if code is None else NativeProgram(code, self._threads)
 
     def _compile(self, width: int) -> Runnable:
@@ -126,8 +127,7 @@ class ByWidth:
 
         Passes that do not fit bit planes run on cells.
         """
-        key = start_key(self._ruleset, width)
-        with turn(current().place(), key):
+        with turn(current().place(), self._key(width)):
             if (program := self._recall(width)) is not None:
                 return program
             program = mixed_program(
@@ -136,8 +136,8 @@ class ByWidth:
                 lambda cells: TorchProgram(cells, torch.device("cpu")),
             )
             if isinstance(program, NativeProgram):
-                remember(key, program.code)
-                remember(start_key(self._ruleset), program.code)
+                remember(self._key(width), program.code)
+                remember(self._key(), program.code)
         return program
 
     def native(self, width: int) -> NativeProgram | None:

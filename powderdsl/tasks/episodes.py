@@ -98,7 +98,7 @@ class TaskProgram:
         self._asked = {part.value for part in scalars if part.op == "action"}
         """The numbers of an action that the goal uses."""
         self.hands = Hands(simulator, task.agent, task.size, counts="painted" in self._asked)
-        self.laws = Laws(task, simulator)
+        self.laws = Laws(task, simulator.ruleset)
         """The laws that observations can show."""
         self.action_nvec = task.agent.action_nvec
         """The numbers of values of x, y, choice, vx and vy. `Task.agent.choices` lists the choices."""

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from powderdsl.model.types import Ruleset
-from powderdsl.simulation.simulator import Simulator
+from powderdsl.simulation.simulator import compile as compile_ruleset
 from powderdsl.tasks.task import Task
 
 SIDE, BLOCK, STEPS, SAMPLES = 16, 4, 8, 4
@@ -24,12 +24,13 @@ def tried_pairs(ruleset: Ruleset) -> Tensor:
     return torch.tensor(list(permutations(sorted(element.id for element in ruleset.elements), 2)))
 
 
-def experiments(simulator: Simulator) -> Tensor:
+def experiments(ruleset: Ruleset) -> Tensor:
     """The outcomes of experiments with every pair of elements, in the order of ids: uint8 [pairs · 4].
 
     127 or 128 means no change; 255 means a move by `STEPS` cells down or right, or twice the amount.
     """
-    pairs = tried_pairs(simulator.ruleset)
+    # All backends agree. Native code would take longer to compile than these steps.
+    simulator, pairs = compile_ruleset(ruleset), tried_pairs(ruleset)
     inner, outer = pairs.repeat_interleave(SAMPLES, 0).T
     first = (SIDE - BLOCK) // 2
     ids = outer[:, None, None].repeat(1, SIDE, SIDE)
@@ -50,14 +51,13 @@ def experiments(simulator: Simulator) -> Tensor:
 class Laws:
     """Encodes the laws of a task's worlds as bytes: experiments, if rulesets differ between worlds, then parameters."""
 
-    def __init__(self, task: Task, simulator: Simulator):
-        self._simulator, splits = simulator, task.splits
-        self._experiments = torch.zeros(0, dtype=torch.uint8)
-        elements = simulator.ruleset.elements
+    def __init__(self, task: Task, ruleset: Ruleset):
+        self._ruleset, self._experiments = ruleset, torch.zeros(0, dtype=torch.uint8)
+        elements = ruleset.elements
         self._tries = len(elements) * (len(elements) - 1) * len(NUMBERS)
-        self._mixed = any(split.rulesets for split in splits)
+        self._mixed = any(split.rulesets for split in task.splits)
         ranges: dict[str, tuple[float, float]] = {}
-        for part in (part for split in splits for part in split.params):
+        for part in (part for split in task.splits for part in split.params):
             low, high = ranges.get(part.name, (part.low, part.high))
             ranges[part.name] = min(low, part.low), max(high, part.high)
         self._ranges = ranges
@@ -68,8 +68,8 @@ class Laws:
     def of(self, params: Mapping[str, Tensor], worlds: int) -> Tensor:
         """The laws of worlds, uint8 [B, n], with some parameters, float64 [B] each, and defaults for the others."""
         if self._mixed and not len(self._experiments):
-            self._experiments = experiments(self._simulator)
-        defaults = {param.name: float(param.default) for param in self._simulator.ruleset.params}
+            self._experiments = experiments(self._ruleset)
+        defaults = {param.name: float(param.default) for param in self._ruleset.params}
         values = [self._experiments.expand(worlds, -1)]
         for name, (low, high) in self._ranges.items():
             value = torch.as_tensor(params.get(name, defaults[name]), dtype=torch.float64).cpu()
