@@ -28,7 +28,7 @@ T = TypeVar("T")
 
 NAME = re.compile(r"([0-9a-f]+)-([0-9a-f]{64})-(.+)")
 HOME = re.compile(r"[0-9a-f]{1,2}")
-"""The name of a folder of files: the first digits of their keys. Searching a folder of all files would take long."""
+"""The name of a folder: the first digits of the keys in it. Searching one large folder for a key would be slow."""
 
 LIMIT, MOST = 512 << 20, 4000
 """Maximum number of bytes, and of files. The least recently used are removed first."""
