@@ -60,6 +60,17 @@ def attr_text(attr: object) -> str:
     return "value" if attr is None else str(attr)
 
 
+SIGNS = {
+    "and": "&", "or": "|", "xor": "^", "add": "+", "sub": "-", "mul": "*", "div": "/", "eq": "==", "lt": "<", "le": "<=",
+}  # fmt: skip
+"""The operations that are written between their arguments."""
+
+
+def infix(names: str) -> dict[str, str]:
+    """The expressions of some operations in generated code, with the arguments by number."""
+    return {name: f"{{0}} {SIGNS[name]} {{1}}" for name in names.split()}
+
+
 def structure(pass_: PassGraph, *, places: bool = True) -> bytes:
     """A digest that is equal for two passes only if every stage gives equal results for both.
 

@@ -14,7 +14,7 @@ from functools import cached_property
 from typing import Any, Literal, Self, TypeVar
 
 from powderdsl.ir.ops import FLAG, REAL, Graph, Item, Node, Type, ordered, walk
-from powderdsl.ir.text import attr_text
+from powderdsl.ir.text import SIGNS, attr_text
 
 ANSWER = Type("answer")
 """One truth value for all cells, such as whether a flag is set anywhere."""
@@ -495,10 +495,6 @@ class Namer:
 # zero outside the grid with `|0`; `a ? b : c` is a choice; `any p3 | p4` tests whether a flag holds in some cell; `else
 # p5 = p1` gives the value of a variable if a guard's body is skipped.
 
-_INFIX = {
-    "and": "&", "or": "|", "xor": "^", "add": "+", "sub": "-", "mul": "*", "div": "/", "eq": "==", "lt": "<", "le": "<=",
-}  # fmt: skip
-
 
 def print_schedule(schedule: Schedule) -> str:
     names = _Names()
@@ -624,7 +620,7 @@ class _Values:
                 return f"{args[0]}[{dy},{dx}{'' if wraps else '|0'}]"
             case "present":
                 return f"present({node.attr:#x})"
-        if node.op in _INFIX and len(args) == 2:
-            return f"({args[0]} {_INFIX[node.op]} {args[1]})"
+        if node.op in SIGNS and len(args) == 2:
+            return f"({args[0]} {SIGNS[node.op]} {args[1]})"
         args += [] if node.attr is None else [attr_text(node.attr)]
         return f"{node.op}({', '.join(args)})"

@@ -7,6 +7,7 @@ from contextlib import contextmanager
 from typing import Any, Generic, TypeVar
 
 from powderdsl.ir.ops import Node, needed, ordered
+from powderdsl.ir.text import infix
 from powderdsl.schedule.costs import DRAWS
 from powderdsl.schedule.types import Compute, Out, Statement
 from powderdsl.schedule.words import is_whole
@@ -79,14 +80,16 @@ class Values(Generic[Named]):
         self.lines, self.known = outer, known
 
 
-GATES = {
-    "not": "~{0}",
-    "and": "{0} & {1}",
-    "or": "{0} | {1}",
-    "xor": "{0} ^ {1}",
-    "select": "mux({0}, {1}, {2})",
-}
+GATES = infix("and or xor") | {"not": "~{0}", "select": "mux({0}, {1}, {2})"}
 """The expression of each gate in C++ and CUDA, with the arguments by number."""
+
+FLOATS = infix("add sub mul") | {
+    "div": "divide({0}, {1})",
+    "neg": "-{0}",
+    "min": "smaller({0}, {1})",
+    "max": "larger({0}, {1})",
+}
+"""The expressions of operations on floats that are the same in C++ and CUDA."""
 
 
 class WordText(Values[str]):

@@ -9,7 +9,7 @@ from powderdsl.schedule.join import keeps_values
 from powderdsl.schedule.rows import ANY_PASS, RowLoop, Rows, region_of, rows_of
 from powderdsl.schedule.types import Sweeps, alternatives, is_zero
 from powderdsl.targets.layout import NativeLayout, braced, literal, param_key
-from powderdsl.targets.printing import CellValues
+from powderdsl.targets.printing import FLOATS, CellValues
 
 AT_ONCE = 4
 """Choices that are skipped together: a branch for each choice would be hard to predict."""
@@ -17,18 +17,11 @@ AT_ONCE = 4
 PLACE = "const int lane = strips > 1 ? l + y / height : l, row = y - (lane - l) * height; (void)lane; (void)row;"  # fmt: skip
 """The lane and the row of planes that contain the words of row y."""
 
-_FLOATS = {
+_FLOATS = FLOATS | {
     "eq": "bits_eq({0}, {1})",
     "lt": "bits_lt({0}, {1})",
     "le": "bits_le({0}, {1})",
-    "add": "{0} + {1}",
-    "sub": "{0} - {1}",
-    "mul": "{0} * {1}",
-    "div": "divide({0}, {1})",
-    "neg": "-{0}",
     "abs": "magnitude({0})",
-    "min": "smaller({0}, {1})",
-    "max": "larger({0}, {1})",
     "sqrt": "root({0})",
     "clamp": "clamped({0}, {1}, {2}, SNAP)",
 }

@@ -5,22 +5,15 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 
 from powderdsl.ir.ops import FLAG, REAL, Node, ordered
+from powderdsl.ir.text import infix
 from powderdsl.schedule.types import ANSWER, Compute, Guard, Schedule, Sync
 from powderdsl.targets.layout import Layout, literal, param_key
-from powderdsl.targets.printing import GATES, CellValues, Printer, WordText, drawn_where
+from powderdsl.targets.printing import FLOATS, GATES, CellValues, Printer, WordText, drawn_where
 
 _FLOATS = {
-    "eq": "{0} == {1}",
-    "lt": "{0} < {1}",
-    "le": "{0} <= {1}",
-    "add": "{0} + {1}",
-    "sub": "{0} - {1}",
-    "mul": "{0} * {1}",
-    "div": "divide({0}, {1})",
-    "neg": "-{0}",
+    **FLOATS,
+    **infix("eq lt le"),
     "abs": "MAGNITUDE({0})",
-    "min": "smaller({0}, {1})",
-    "max": "larger({0}, {1})",
     "sqrt": "ROOT({0})",
     "clamp": "clamped({0}, {1}, {2})",
 }

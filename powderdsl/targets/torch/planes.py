@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 from powderdsl.ir.ops import COMMUTATIVE, OPS, REAL, Node, Offset, PassGraph, Program, needed
+from powderdsl.ir.text import infix
 from powderdsl.schedule.types import leftover
 from powderdsl.targets.layout import param_key
 from powderdsl.targets.torch.source import comment_of, with_deletions
@@ -88,20 +89,13 @@ _IN_PLACE = {
 }
 """Operations that may overwrite their first argument, or the second if they are commutative."""
 
-_FLAGS = {
-    "and": "{0} & {1}",
-    "or": "{0} | {1}",
-    "xor": "{0} ^ {1}",
-    "not": "~{0}",
-    "select": "{2} ^ ({0} & ({1} ^ {2}))",
-}
 _COMPARED = {"eq": "~({0} ^ {1})", "lt": "~{0} & {1}", "le": "~{0} | {1}"}
 """The comparison of two flags."""
 
-_REALS = {
-    "add": "{0} + {1}",
-    "sub": "{0} - {1}",
-    "mul": "{0} * {1}",
+_EXPRESSIONS = {
+    **infix("and or xor add sub mul"),
+    "not": "~{0}",
+    "select": "{2} ^ ({0} & ({1} ^ {2}))",
     "div": "k.divide({0}, {1})",
     "neg": "-{0}",
     "abs": "{0}.abs()",
@@ -109,6 +103,7 @@ _REALS = {
     "max": "k.maximum({0}, {1})",
     "sqrt": "k.square_root({0})",
 }
+"""Other operations on flags and floats, except choices between floats."""
 
 
 class _Writer:
@@ -272,7 +267,7 @@ class _Writer:
         args = [*map(self.of, node.args)]
         if node.op in _COMPARED and node.args[0].type == REAL:
             return f"k.compare({node.op!r}, {args[0]}, {args[1]})", args
-        return (_COMPARED.get(node.op) or _FLAGS[node.op]).format(*args), args
+        return (_COMPARED.get(node.op) or _EXPRESSIONS[node.op]).format(*args), args
 
     def shift(self, plane: str, dy: int, dx: int, wraps: bool) -> tuple[str, list[str]]:
         text, args = plane, [plane]
@@ -306,7 +301,7 @@ class _Writer:
             return f"k.choose({self.input('inside_mask', dy, dx)}, {rolled}, 0.0)", [rolled]
         if node.op == "clamp":
             return f"k.clamp({args[0]}, {node.attr[0]!r}, {node.attr[1]!r})", args
-        return _REALS[node.op].format(*args), args
+        return _EXPRESSIONS[node.op].format(*args), args
 
     def choice(self, flag: Node, yes: Node, no: Node) -> tuple[str, list[str]]:
         mask, old = self.cells(flag), self.of(no)

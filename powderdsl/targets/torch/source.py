@@ -9,6 +9,7 @@ from typing import Any
 from zlib import crc32
 
 from powderdsl.ir.ops import Node, PassGraph, Program, nodes_of
+from powderdsl.ir.text import infix
 
 _QUOTED = re.compile(r"'[^']*'")
 _PLANE = re.compile(r"\b[bfmn][0-9]+\b")
@@ -81,18 +82,10 @@ _KERNELS: dict[str, str | Callable[..., str]] = {
         "roll" if node.attr[2] else "reach", x, *node.attr[:2]
     ),
     "count": "k.count({0}, {attr[0]}, {attr[1]})",
+    **infix("and or xor eq lt le add sub mul"),
     "not": "~{0}",
-    "and": "{0} & {1}",
-    "or": "{0} | {1}",
-    "xor": "{0} ^ {1}",
     "in_set": _in_set,
     "table": lambda writer, node, index: f"{writer.constant(node.attr)}[{index}.long()]",
-    "eq": "{0} == {1}",
-    "lt": "{0} < {1}",
-    "le": "{0} <= {1}",
-    "add": "{0} + {1}",
-    "sub": "{0} - {1}",
-    "mul": "{0} * {1}",
     "div": "({0} / {1}).masked_fill({1} == 0, 0)",
     "quotient": (
         "torch.div({0}, {1}.masked_fill({1} == 0, 1), rounding_mode='floor').masked_fill({1} == 0, 0)"
