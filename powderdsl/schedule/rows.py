@@ -12,9 +12,6 @@ from powderdsl.schedule.types import Compute, Out, Schedule, Sweeps, alternative
 ANY_PASS = 1 << 30
 """The reach of a field that ends up in a slot: any pass may read it."""
 
-TURNED = 16
-"""The turned masks of a loop begin at a multiple of this many words: the most that a vector has."""
-
 
 @dataclass(frozen=True)
 class Ring:
@@ -29,29 +26,10 @@ class Ring:
 
 
 @dataclass(frozen=True)
-class RowLoop:
-    """A loop over cells in a run of loops.
-
-    Before the run, the rows in which the planes `marked` hold a flag are marked: there the loop has work. A loop over
-    choices has `chains` and `masks`; its masks begin at word `first_mask` of all turned masks.
-    """
-
-    loop: Compute
-    marked: tuple[str, ...]
-    chains: tuple[tuple[Node, ...], ...]
-    first_mask: int
-
-    @property
-    def masks(self) -> tuple[str, ...]:
-        """The planes of the masks, in the order in which choices are applied."""
-        return tuple(choice.args[0].attr for choice in self.chains[0]) if self.chains else ()
-
-
-@dataclass(frozen=True)
 class Rows:
     """A run of loops over cells."""
 
-    loops: tuple[RowLoop, ...]
+    loops: tuple[Compute, ...]
     rings: Mapping[str, Ring]
     """The passing fields: their rows are buffered until later loops have read them."""
     saved: Mapping[str, tuple[int, int]]
@@ -59,8 +37,6 @@ class Rows:
     and the position of the first among all buffered rows."""
     waiting: int
     """The number of buffered rows."""
-    turned: int
-    """The number of words of turned masks."""
     places: Mapping[str, str]
     """In a loop that changes fields in place: the variable that holds the old values of another."""
     reaches: Mapping[str, int]
@@ -68,24 +44,14 @@ class Rows:
 
     @property
     def outs(self) -> list[Out]:
-        return [out for part in self.loops for out in part.loop.outs]
+        return [out for loop in self.loops for out in loop.outs]
 
 
 def rows_of(sweeps: Sweeps, reaches: Mapping[str, int]) -> Rows:
     """The plan of loops that run together."""
-    rings, saved, waiting = _buffer_rows(sweeps)
-    loops = []
-    turned = 0
-    for loop in sweeps.body:
-        chains = chains_of(loop) if loop.over == "choices" else []
-        _, planes = region_of(loop)
-        # Choices test their masks themselves.
-        marked = [] if chains else [name for name in planes if name not in sweeps.vars]
-        loops.append(RowLoop(loop, tuple(marked), tuple(map(tuple, chains)), turned))
-        turned += -(-len(loops[-1].masks) // TURNED) * TURNED
     kept = sweeps.body[0].outs if keeps_values(sweeps.body[0]) else ()
     places = {out.into: out.var.name for out in kept if out.into is not None}
-    return Rows(tuple(loops), rings, saved, waiting, turned, places, reaches)
+    return Rows(sweeps.body, *_buffer_rows(sweeps), places, reaches)
 
 
 def _buffer_rows(sweeps: Sweeps) -> tuple[dict[str, Ring], dict[str, tuple[int, int]], int]:

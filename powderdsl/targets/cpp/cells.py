@@ -6,10 +6,13 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 
 from powderdsl.ir.ops import FLAG, REAL, Node, all_ones, ordered, single
 from powderdsl.schedule.join import keeps_values
-from powderdsl.schedule.rows import ANY_PASS, RowLoop, Rows, region_of, rows_of
-from powderdsl.schedule.types import Sweeps, alternatives, is_zero
+from powderdsl.schedule.rows import ANY_PASS, Rows, chains_of, region_of, rows_of
+from powderdsl.schedule.types import Compute, Sweeps, alternatives, is_zero
 from powderdsl.targets.layout import NativeLayout, braced, literal, param_key
 from powderdsl.targets.printing import FLOATS, CellValues
+
+TURNED = 16
+"""The turned masks of a loop begin at a multiple of this many words: the most that a vector has."""
 
 AT_ONCE = 4
 """Choices that are skipped together: a branch for each choice would be hard to predict."""
@@ -31,20 +34,23 @@ _FLOATS = FLOATS | {
 def sweeps_text(sweeps: Sweeps, layout: NativeLayout, reaches: Mapping[str, int]) -> str:
     """The text of one loop over worlds (EACH_WORLD in fields.hpp)."""
     rows = rows_of(sweeps, reaches)
-    loops = [_Loop(number, plan, rows, layout) for number, plan in enumerate(rows.loops)]
+    loops, turned = list[_Loop](), 0
+    for number, own in enumerate(rows.loops):
+        loops.append(_Loop(number, own, turned, rows, layout))
+        turned += -(-len(loops[-1].masks) // TURNED) * TURNED
     if keeps_values(sweeps.body[0]):
         return _in_place(loops[0])
-    layout.cover(turned=rows.turned, waiting=rows.waiting)
+    layout.cover(turned=turned, waiting=rows.waiting)
     depths = [(name, ring.depth) for name, ring in rows.rings.items()]
     pointers = " ".join(f"const float* at{n}[{d}]; std::fill_n(at{n}, {d}, nothing);" for n, d in depths)
     for name, (count, first) in rows.saved.items():
         pointers += f" KEEP_FIRST({name}, {count}, {first})"
     lines = [line for loop in loops for line in loop.before()]
-    lines += [loop.turns() for loop in loops if loop.plan.chains]
+    lines += [loop.turns() for loop in loops if loop.chains]
     lines += [_addresses(rows), f"EACH_WORLD {{ {pointers}"]
     part = -1
     for loop in loops:
-        own = loop.plan.loop
+        own = loop.loop
         lag, last = own.lag, max(other.lag for other in sweeps.body if other.part == own.part)
         if own.part != part:
             lines += ["}"] if loop.number else []
@@ -84,7 +90,7 @@ def _in_place(loop: _Loop) -> str:
 
 def _addresses(rows: Rows) -> str:
     """Copies of the addresses that loops need: the compiler cannot prove that stores do not change the originals."""
-    values = [value for plan in rows.loops for value in plan.loop.values]
+    values = [value for loop in rows.loops for value in loop.values]
     loads = {str(node.attr): node.type for node in ordered(values) if node.op == "load"}
     types = {rows.places.get(name, name): type for name, type in loads.items()}
     types |= {out.var.name: out.var.type for out in rows.outs}
@@ -96,7 +102,7 @@ def _nothing(rows: Rows) -> list[str]:
     """Tests of fields and planes; if all are true, the loops do nothing."""
     results = {out.var.name for out in rows.outs}
     tests = []
-    for region in (plan.loop.region for plan in rows.loops):
+    for region in (loop.region for loop in rows.loops):
         for part in alternatives(region):
             name, test = (part.args[0].attr, "still") if part.op == "live" else (part.attr, "zero")
             tests += [f"{name}->{test}"] if name not in results else []
@@ -120,10 +126,20 @@ def on_all(type: str, items: Iterable[str], call: str) -> str:
 class _Loop(CellValues[str]):
     """The text of row y of a loop. Values belong to the cells of a chunk: floats, or flags as bits."""
 
-    def __init__(self, number: int, plan: RowLoop, rows: Rows, layout: NativeLayout):
-        super().__init__(ordered(plan.loop.results))
-        self.number, self.plan, self.rows, self.layout = number, plan, rows, layout
-        self.outs = plan.loop.outs
+    def __init__(self, number: int, loop: Compute, first_mask: int, rows: Rows, layout: NativeLayout):
+        super().__init__(ordered(loop.results))
+        self.number, self.loop, self.rows, self.layout = number, loop, rows, layout
+        self.outs = loop.outs
+        self.chains = chains_of(loop) if loop.over == "choices" else []
+        self.masks: list[str] = [choice.args[0].attr for choice in self.chains[0]] if self.chains else []
+        """The planes of the masks, in the order in which choices are applied."""
+        self.first_mask = first_mask
+        """The word of all turned masks at which its masks begin."""
+        results = {out.var.name for out in rows.outs}
+        self.live, self.planes = region_of(loop)
+        # Choices test their masks themselves.
+        self.marked = [] if self.chains else [name for name in self.planes if name not in results]
+        """The planes whose rows with flags are marked before all loops: there the loop has work."""
         self.passing = [out.var.name for out in self.outs if out.var.name in rows.rings]
         self.lasting = [out for out in self.outs if out.var.type == REAL and out.var.name not in rows.rings]
         self.fields = [out.var.name for out in self.outs if out.var.type == REAL]
@@ -132,7 +148,7 @@ class _Loop(CellValues[str]):
         """Names of pointers to rows, set up once a row, by their values."""
         self.words: dict[str, str] = {}
         """Names of words of planes, read once a row and word, by the plane."""
-        layout.cover(marks=number + 1 if plan.marked else 0, marked=len(plan.marked))
+        layout.cover(marks=number + 1 if self.marked else 0, marked=len(self.marked))
 
     def before(self) -> Iterator[str]:
         """Statements before the loop: memory for its results, and the marks of its rows."""
@@ -144,21 +160,20 @@ class _Loop(CellValues[str]):
 
     def marking(self) -> Iterator[str]:
         """Mark the rows in which the region's planes hold a flag, for all lanes at once."""
-        if planes := self.plan.marked:
+        if planes := self.marked:
             yield on_all("const Plane* const", planes, f"mark_rows(c, {self.number}, all, {len(planes)});")
 
     def turns(self) -> str:
         """A call that stores the masks of choices lane by lane."""
-        masks = self.plan.masks
-        call = f"turn_masks(c, all, {len(masks)}, {self.plan.first_mask});"
-        return on_all("const Plane* const", masks, call)
+        call = f"turn_masks(c, all, {len(self.masks)}, {self.first_mask});"
+        return on_all("const Plane* const", self.masks, call)
 
     def after(self) -> str:
         ends = [f"{out.var.name}->still = !some{out.var.name};" for out in self.lasting]
         return " ".join([*ends, *(f"close_plane(c, {name});" for name in self.flags)])
 
     def text(self) -> str:
-        return "\n".join(self.choice_row() if self.plan.chains else self.cell_row())
+        return "\n".join(self.choice_row() if self.chains else self.cell_row())
 
     # Rows that are written
 
@@ -191,7 +206,7 @@ class _Loop(CellValues[str]):
                 yield f"finish_row<{'REACH' if reach == ANY_PASS else reach}>(c, o{name});"
 
     def row_outside_region(self) -> Iterator[str]:
-        for name, value in self.plan.loop.olds.items():
+        for name, value in self.loop.olds.items():
             if name in self.rows.rings:
                 yield f"{self.at(name, 0)} = nothing;"
             elif value.type == REAL and value.op == "const":
@@ -218,12 +233,10 @@ class _Loop(CellValues[str]):
                 live = f"const bool some = any((V)(n{name} + n{name}));"
                 lives.append(f"{{ {live} v{name}.live[base + y] = some; some{name} |= some; }}")
         yield PLACE
-        if self.plan.loop.region is not None:
-            fields, planes = region_of(self.plan.loop)
-            marked = self.plan.marked
-            tests = [self.is_row_live(field) for field in fields]
-            tests += [f"(c.marks[{self.number} * height + row] >> lane & 1)"] if marked else []
-            rest = [name for name in planes if name not in marked]
+        if self.loop.region is not None:
+            tests = [self.is_row_live(field) for field in self.live]
+            tests += [f"(c.marks[{self.number} * height + row] >> lane & 1)"] if self.marked else []
+            rest = [name for name in self.planes if name not in self.marked]
             scans = [f"some |= row_bits(v{name}, row * words, words, lane);" for name in rest]
             busy = " || ".join(tests) or "false"
             yield f"Word some = {busy};" + (f" if (!some) {{ {' '.join(scans)} }}" if scans else "")
@@ -236,7 +249,7 @@ class _Loop(CellValues[str]):
         yield "EACH_CHUNK { const u32 inside = inside_of(x, width); (void)inside;"
         yield from (*self.lines, *stores)
         yield "} }"
-        yield " ".join([*self.ends(), *lives, "" if self.plan.loop.region is None else "}"])
+        yield " ".join([*self.ends(), *lives, "" if self.loop.region is None else "}"])
 
     def rows_read(self) -> list[str]:
         return [f"const float* {name} = {call};" for call, name in self.pointers.items()]
@@ -249,7 +262,7 @@ class _Loop(CellValues[str]):
 
     def choice_row(self) -> Iterator[str]:
         """A row of all choices: the columns of a word stay in registers while its choices are applied."""
-        chains, count = self.plan.chains, len(self.plan.masks)
+        chains, count = self.chains, len(self.masks)
         heads = [f"g{number}[k]" for number in range(len(chains))]
         bases = [str(chain[0].args[2].attr) for chain in chains]
         levels = []
@@ -264,7 +277,7 @@ class _Loop(CellValues[str]):
             stores = [f"*(F*)(o{out.var.name} + x) = {self.of(out.value)};" for out in self.outs]
         ends += stores
         olds_at = [self.row(base, 0) for base in bases]
-        yield f"const Word* turned = turned_row(c, base + y) + {self.plan.first_mask}; const bool any = any_turned(c, turned, {count});"
+        yield f"const Word* turned = turned_row(c, base + y) + {self.first_mask}; const bool any = any_turned(c, turned, {count});"
         lives = [
             f"{self.at(name, 0)} != nothing" if name in self.rows.rings else f"{name}->live[base + y]"
             for name in dict.fromkeys(bases)
