@@ -93,7 +93,7 @@ def _tables(env: TensorEnv, plan: Plan, places: Places, episodes: Episodes) -> I
             assignments.append(f"p.{name} = Formula{{{len(rows)}, {names[name]}}};")
         else:
             yield _numbers(names[name], values)
-    slots = {piece.slot: places.homes[piece.slot] for parts in places.pieces.values() for piece in parts}
+    slots = {piece.name: places.homes[piece.name] for parts in places.pieces.values() for piece in parts}
     fresh = [name for name in names if name.startswith("fresh ")]
     rows = [braced((*slots[name.removeprefix("fresh ")][:2], names[name])) for name in fresh]
     yield _array("Fresh", "FRESH", rows)
@@ -148,9 +148,8 @@ def _worlds(env: TensorEnv, places: Places, episodes: Episodes) -> Iterator[str]
         values = episodes.world.state[name].numpy()
         usual = env.program.hands.blocks.tables[name].numpy()
         for piece in parts:
-            cells = values if piece.component is None else values[:, piece.component]
-            table = usual if piece.component is None else usual[:, piece.component]
-            slot, bits, _ = places.homes[piece.slot]
+            cells, table = piece.of(values), piece.of(usual)
+            slot, bits, _ = places.homes[piece.name]
             home, label = (slot, bits, cells.dtype.itemsize), f"CELLS_{len(entries)}"
             if name != "element" and (cells == table[ids]).all():
                 yield _array("u32", label, _words(table))

@@ -332,8 +332,8 @@ def plane_slots(slots: Iterable[SlotType]) -> tuple[SlotType, ...]:
         if slot.type.name != "int":
             planes.append(slot)
             continue
-        for i in range(slot.type.bits):
-            planes.append(SlotType(plane_name(slot.name, i), FLAG, int(slot.default) >> i & 1, slot.resets))
+        for i, name in enumerate(slot.planes):
+            planes.append(SlotType(name, FLAG, int(slot.default) >> i & 1, slot.resets))
     return tuple(planes)
 
 

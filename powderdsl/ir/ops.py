@@ -12,7 +12,7 @@ import struct
 from array import array
 from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from functools import reduce
+from functools import cached_property, reduce
 from itertools import chain, starmap
 from typing import Any, TypeVar
 
@@ -380,6 +380,17 @@ class SlotType:
     resets: bool
     state: str = ""
     component: int | None = None
+
+    def of(self, array: Any) -> Any:
+        """The slot's part of the state's array [B, H, W], or [B, 2, H, W] for a vector."""
+        return array if self.component is None else array[:, self.component]
+
+    @cached_property
+    def planes(self) -> tuple[str, ...]:
+        """The slots of its bit planes, lowest first; the slot itself for flags and floats."""
+        if self.type.name != "int":
+            return (self.name,)
+        return tuple(plane_name(self.name, i) for i in range(self.type.bits))
 
 
 def component_names(name: str) -> tuple[str, str]:

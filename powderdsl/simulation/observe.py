@@ -124,7 +124,7 @@ class Observer:
                     numbers = *ids, ramp.id, int(not field[1]), *map(int, field), len(ramp.starts)
                     views.add("ramp", *numbers, tables=[ramp.colors, ramp.starts])
                 for tint in shown["tints"]:
-                    parts = (homes[piece.slot][0] for piece in program.pieces[tint.field])
+                    parts = (homes[piece.name][0] for piece in program.pieces[tint.field])
                     views.add("tint", *parts, tables=[torch.tensor([*tint.color, tint.full, tint.most])])
             case "matrix":
                 channels, tables = self._channels

@@ -8,6 +8,7 @@ from typing import Any
 
 from powderdsl.compiler import lower, parts
 from powderdsl.ir.bits import choose_form
+from powderdsl.ir.ops import SlotType
 from powderdsl.model.state import (
     Slot,
     fits,
@@ -21,7 +22,7 @@ from powderdsl.model.state import (
 from powderdsl.model.types import Ruleset
 from powderdsl.system.cache import Memo
 from powderdsl.system.writing import failure
-from powderdsl.targets.layout import Piece, pieces
+from powderdsl.targets.layout import pieces
 from powderdsl.targets.wasm.source import wasm_module
 from powderdsl.targets.wasm.standalone import ModuleData, ModuleParameter, Stored
 
@@ -72,7 +73,7 @@ def standalone_module(ruleset: Ruleset, size: tuple[int, int], memo: Memo | None
     return wasm_module(segments[0].planes, size[1], face=face, memo=memo).code
 
 
-def _stored(slot: Slot, ruleset: Ruleset, parts: tuple[Piece, ...]) -> Stored:
+def _stored(slot: Slot, ruleset: Ruleset, parts: tuple[SlotType, ...]) -> Stored:
     prop = ruleset.property(slot.name)
     usual = fresh_values(ruleset, slot)
     number = float if slot.dtype == "float32" else int

@@ -11,45 +11,15 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
 
-from powderdsl.ir.ops import Node, Program, Threshold, Type, nodes_of, plane_name
+from powderdsl.ir.ops import REAL, Node, Program, SlotType, Threshold, nodes_of
 
 
-@dataclass(frozen=True)
-class Piece:
-    """An array of the state, or one component of a vector, and the slot of the program that holds it."""
-
-    state: str
-    component: int | None
-    slot: str
-    type: Type
-
-    def of(self, array: Any) -> Any:
-        """The piece of an array [B, H, W], or [B, 2, H, W] for a vector."""
-        return array if self.component is None else array[:, self.component]
-
-    @cached_property
-    def planes(self) -> tuple[str, ...]:
-        """The slots of its bit planes, lowest first; the slot itself for flags and floats."""
-        if self.type.name != "int":
-            return (self.slot,)
-        return tuple(plane_name(self.slot, i) for i in range(self.type.bits))
-
-    @property
-    def signed(self) -> bool:
-        """True if the highest plane is a sign bit."""
-        return self.type.name == "int" and self.type.signed
-
-    @property
-    def is_real(self) -> bool:
-        return self.type.name == "real"
-
-
-def pieces(program: Program) -> dict[str, tuple[Piece, ...]]:
-    """The pieces of each state array of a program on numbers, by the array's name."""
-    groups: dict[str, tuple[Piece, ...]] = {}
+def pieces(program: Program) -> dict[str, tuple[SlotType, ...]]:
+    """The slots of each state array of a program on numbers, by the array's name."""
+    groups: dict[str, tuple[SlotType, ...]] = {}
     for slot in program.slots:
-        piece = Piece(slot.state or slot.name, slot.component, slot.name, slot.type)
-        groups[piece.state] = (*groups.get(piece.state, ()), piece)
+        name = slot.state or slot.name
+        groups[name] = (*groups.get(name, ()), slot)
     return groups
 
 
@@ -73,13 +43,13 @@ class Layout:
     step_planes: dict[tuple[int, int], int] = field(default_factory=dict)
     fixed: dict[tuple[int, int, int], int] = field(default_factory=dict)
 
-    def home(self, piece: Piece) -> tuple[int, int, bool]:
+    def home(self, piece: SlotType) -> tuple[int, int, bool]:
         """The location of a piece of the state: the number of its field, 0 and False; or the number of its first plane, the
         number of planes, and True if the last plane is a sign.
         """
-        if piece.is_real:
-            return self.reals[piece.slot], 0, False
-        return self.planes[piece.planes[0]], len(piece.planes), piece.signed
+        if piece.type == REAL:
+            return self.reals[piece.name], 0, False
+        return self.planes[piece.planes[0]], len(piece.planes), piece.type.signed
 
     @cached_property
     def _bits(self) -> tuple[dict[Threshold | None, dict[str, None]], list[int], list[int]]:

@@ -147,10 +147,10 @@ class Arguments:
         for name, table in blocks.fresh.items():
             values = table.cpu()[ids]
             for piece in self.places.pieces[name]:
-                part = values if piece.component is None else values[:, piece.component]
-                slot, bits, _ = self.places.homes[piece.slot]
+                part = piece.of(values)
+                slot, bits, _ = self.places.homes[piece.name]
                 numbers = part.long() if bits else part.float()
-                fresh.append(Fresh(slot, bits, self.address(f"fresh {piece.slot}", numbers)))
+                fresh.append(Fresh(slot, bits, self.address(f"fresh {piece.name}", numbers)))
         structure.fresh_count, structure.fresh = (
             len(fresh),
             self.address("fresh", (Fresh * len(fresh))(*fresh)),
@@ -221,7 +221,7 @@ class Plan(Arguments):
         play.choices = self.address("choices", np.array(agent.choices, np.int64))
         self.set_blocks(play, hands.blocks, np.array(agent.choices).clip(0))
         speeds = [] if agent.speed_field is None else places.pieces[agent.speed_field]
-        play.speed_row, play.speed_column = [places.homes[piece.slot][0] for piece in speeds] or (-1, -1)
+        play.speed_row, play.speed_column = [places.homes[piece.name][0] for piece in speeds] or (-1, -1)
         for name in ("each", "final", "success", "failure"):
             steps = operations(getattr(goal, name), program.measure_numbers)
             getattr(play, name).count, getattr(play, name).ops = len(steps), self.address(name, steps)

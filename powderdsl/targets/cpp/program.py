@@ -14,13 +14,13 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from powderdsl.ir.ops import Program
+from powderdsl.ir.ops import Program, SlotType
 from powderdsl.system import cache
 from powderdsl.system.reading import read_bytes
 from powderdsl.targets.cpp.build import build, current, load_library
 from powderdsl.targets.cpp.source import native_source
 from powderdsl.targets.job import Job, Like, OwnedBatch, like_of, shape_of
-from powderdsl.targets.layout import Layout, Piece, pieces
+from powderdsl.targets.layout import Layout, pieces
 
 KEPT_INPUTS = 16
 """The number of parameter mappings whose inputs a program caches."""
@@ -36,7 +36,7 @@ class NativeCode:
     library: Path
     width: int
     layout: Layout
-    pieces: Mapping[str, tuple[Piece, ...]]
+    pieces: Mapping[str, tuple[SlotType, ...]]
     passes: tuple[str, ...]
 
 
@@ -200,9 +200,9 @@ class PackedState(OwnedBatch):
 class Places:
     """The places of a state's pieces in generated code: `homes` are the results of `Layout.home`, by slot."""
 
-    def __init__(self, layout: Layout, pieces: Mapping[str, tuple[Piece, ...]]):
+    def __init__(self, layout: Layout, pieces: Mapping[str, tuple[SlotType, ...]]):
         self.layout, self.pieces = layout, pieces
-        self.homes = {piece.slot: layout.home(piece) for parts in pieces.values() for piece in parts}
+        self.homes = {piece.name: layout.home(piece) for parts in pieces.values() for piece in parts}
 
 
 class NativeProgram(Places):
@@ -259,4 +259,4 @@ class NativeProgram(Places):
 
     def parts(self, name: str, value: Tensor) -> Iterator[tuple[Tensor, int, int, bool]]:
         for piece in self.pieces[name]:
-            yield piece.of(value), *self.homes[piece.slot]
+            yield piece.of(value), *self.homes[piece.name]

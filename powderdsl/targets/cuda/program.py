@@ -20,7 +20,7 @@ import torch
 from torch import Tensor
 
 from powderdsl.ir.bits import Segment
-from powderdsl.ir.ops import Program
+from powderdsl.ir.ops import REAL, Program
 from powderdsl.system import cache as native_cache
 from powderdsl.targets.cuda.source import KernelSource, cuda_source
 from powderdsl.targets.job import Job, Like, PackedArrays, Runnable, like_of, shape_of, unavailable
@@ -250,8 +250,8 @@ class CudaProgram:
         reals = torch.zeros(shape, dtype=torch.float32, device=device)
         for name, value in state.items():
             for piece in self._pieces[name]:
-                if piece.is_real:
-                    reals[:, layout.reals[piece.slot]] = piece.of(value)
+                if piece.type == REAL:
+                    reals[:, layout.reals[piece.name]] = piece.of(value)
                     continue
                 for i, plane in enumerate(piece.planes):
                     words = pack((value >> i) & 1 != 0)
@@ -261,8 +261,8 @@ class CudaProgram:
     def unpack(self, state: DeviceState, name: str) -> Tensor:
         dtype, (*_, height, width) = state.like[name]
         parts, layout = self._pieces[name], self.kernel(height, width)[0].layout
-        if parts[0].is_real:
-            fields = [state.reals[:, layout.reals[piece.slot]] for piece in parts]
+        if parts[0].type == REAL:
+            fields = [state.reals[:, layout.reals[piece.name]] for piece in parts]
             return torch.stack(fields, 1) if len(fields) > 1 else fields[0].clone()
         (piece,) = parts
         words = state.planes[:, [layout.planes[plane] for plane in piece.planes]]
@@ -270,6 +270,6 @@ class CudaProgram:
         flags = (octets[..., None] >> torch.arange(8, dtype=torch.uint8, device=words.device)) & 1
         cells = flags.flatten(-2)[..., :width].to(torch.int32)
         weights = [1 << i for i in range(len(piece.planes))]
-        if piece.signed:
+        if piece.type.signed:
             weights[-1] *= -1
         return reduce(torch.add, [cells[:, i] * weight for i, weight in enumerate(weights)]).to(dtype)

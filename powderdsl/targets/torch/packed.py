@@ -186,8 +186,8 @@ class PlanesProgram:
         for name, array in state.items():
             for piece in self._pieces[name]:
                 cells = k.to_cells(piece.of(array))
-                if piece.is_real:
-                    fields[piece.slot] = cells.contiguous()
+                if piece.type == REAL:
+                    fields[piece.name] = cells.contiguous()
                     continue
                 for i, plane in enumerate(piece.planes):
                     flags = (cells >> i & 1) != 0 if piece.type.name == "int" else cells != 0
@@ -202,12 +202,12 @@ class PlanesProgram:
         dtype = like[name][0]
         parts = []
         for piece in self._pieces[name]:
-            if piece.is_real:
-                parts.append(k.from_cells(fields[self._fields.index(piece.slot)]))
+            if piece.type == REAL:
+                parts.append(k.from_cells(fields[self._fields.index(piece.name)]))
                 continue
             bits = k.bits(torch.stack([words[self._number[plane]] for plane in piece.planes])).to(torch.int32)
             weights = [1 << i for i in range(len(bits))]
-            if piece.signed:
+            if piece.type.signed:
                 weights[-1] = -weights[-1]
             factors = torch.tensor(weights, dtype=torch.int32, device=bits.device).view(-1, 1, 1, 1)
             parts.append(k.from_cells((bits * factors).sum(0)))

@@ -192,8 +192,8 @@ class TorchProgram:
             base_keys(seed, index), self._idents, start, snap=self._snap,
         )  # fmt: skip
         planes = {  # in working dtypes: vectors split, integers widened
-            piece.slot: piece.of(job.state[piece.state]).to(DTYPES[piece.type.name])
-            for parts in self._pieces.values()
+            piece.name: piece.of(job.state[name]).to(DTYPES[piece.type.name])
+            for name, parts in self._pieces.items()
             for piece in parts
         }
         with torch.no_grad():
@@ -212,7 +212,7 @@ class TorchProgram:
                         job.tick(pass_.name)
         packed = {}
         for name, old in job.state.items():
-            parts = [kernels.full(planes[piece.slot]) for piece in self._pieces[name]]
+            parts = [kernels.full(planes[piece.name]) for piece in self._pieces[name]]
             if self._pieces[name][0].component is not None:
                 packed[name] = torch.stack(parts, 1)
             else:  # a copy, also where no pass wrote the plane

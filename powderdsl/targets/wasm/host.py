@@ -9,7 +9,8 @@ import sys
 from collections.abc import Callable
 from typing import Any, Protocol
 
-from powderdsl.targets.layout import Layout, Piece
+from powderdsl.ir.ops import SlotType
+from powderdsl.targets.layout import Layout
 
 TOO_LARGE = "the worlds do not fit into the memory of a WebAssembly module"
 
@@ -102,7 +103,7 @@ def aligned(count: int, by: int = 16) -> int:
     return -(-count // by) * by
 
 
-def numbers_of(piece: Piece, layout: Layout, size: int) -> tuple[int, int, int, int]:
+def numbers_of(piece: SlotType, layout: Layout, size: int) -> tuple[int, int, int, int]:
     """The arguments of `load` and `store` for a piece of the state whose cells have `size` bytes."""
     slot, planes, signed = layout.home(piece)
     return slot if planes else len(layout.planes) + slot, planes, int(signed), size

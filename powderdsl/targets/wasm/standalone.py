@@ -26,8 +26,7 @@ from dataclasses import dataclass
 from functools import partial
 from typing import TypeVar
 
-from powderdsl.ir.ops import SNAP, Threshold
-from powderdsl.targets.layout import Piece
+from powderdsl.ir.ops import REAL, SNAP, SlotType, Threshold
 from powderdsl.targets.wasm.binary import F64, I32, Callee, Local, Value, body, const, load, op
 from powderdsl.targets.wasm.driver import Batches
 from powderdsl.targets.wasm.host import HEADER, aligned, numbers_of
@@ -45,7 +44,7 @@ class Stored:
     """
 
     name: str
-    pieces: tuple[Piece, ...]
+    pieces: tuple[SlotType, ...]
     load: str
     size: int
     usual: tuple[tuple[float, ...], ...]
@@ -73,7 +72,7 @@ class ModuleData:
 
     rows: int
     ids: tuple[int, ...]
-    element: Piece
+    element: SlotType
     fields: tuple[Stored, ...]
     knobs: tuple[ModuleParameter, ...]
     about: bytes
@@ -96,10 +95,10 @@ class Standalone(Batches):
         self.reads: dict[str, Callee] = {}
         self.takes: dict[str, Callee] = {}
 
-    def _parts(self, slot: Stored) -> Iterator[tuple[Piece, int, int]]:
+    def _parts(self, slot: Stored) -> Iterator[tuple[SlotType, int, int]]:
         at = self._place(self.count * slot.size * len(slot.pieces))
         for i, (piece, values) in enumerate(zip(slot.pieces, slot.usual, strict=True)):
-            table = self._data(struct.pack(f"<256{'f' if piece.is_real else 'i'}", *values))
+            table = self._data(struct.pack(f"<256{'f' if piece.type == REAL else 'i'}", *values))
             yield piece, at + i * self.count * slot.size, table
 
     def _place(self, size: int) -> int:
@@ -159,7 +158,7 @@ class Standalone(Batches):
             for piece, at, _ in self.parts[slot.name]:
                 self._move("load", piece, at, slot.size)
 
-    def _move(self, how: str, piece: Piece, address: Value | int, size: int) -> None:
+    def _move(self, how: str, piece: SlotType, address: Value | int, size: int) -> None:
         """`load` or `store` the cells of a piece."""
         body.do(self.calls[how](self.batch, *numbers_of(piece, self.layout, size), address, 0))
 
@@ -192,7 +191,7 @@ class Standalone(Batches):
                 place = body.let(i * slot.size)
                 identity = body.let(load("i32.load8_u", self.cells_at + i))
                 cell = load(slot.load, place, at)
-                if piece.is_real:
+                if piece.type == REAL:
                     value = body.let(_within(cell, low, high))
                     # The comparison is false for NaN and for tiny numbers.
                     large = op("f32.ge", op("f32.abs", value), SNAP)
@@ -257,7 +256,7 @@ class Standalone(Batches):
             with body.when(component >= len(slot.pieces)):
                 body.leave()
             body.do(self.reads[slot.name]())
-            convert = "f32.demote_f64" if slot.pieces[0].is_real else "i32.trunc_sat_f64_s"
+            convert = "f32.demote_f64" if slot.pieces[0].type == REAL else "i32.trunc_sat_f64_s"
             stored = body.let(op(convert, _within(value, slot.low, slot.high)))
             base = body.let(component * (self.count * slot.size))
             with self._each_cell(top, bottom, left, right) as cell:
@@ -299,8 +298,8 @@ def _of_number(number: Value, items: Iterable[Item]) -> Iterator[Item]:
             yield item
 
 
-def _fresh_value(piece: Piece, element: Value, table: int) -> Value:
-    return load("f32.load" if piece.is_real else "i32.load", element << 2, table)
+def _fresh_value(piece: SlotType, element: Value, table: int) -> Value:
+    return load("f32.load" if piece.type == REAL else "i32.load", element << 2, table)
 
 
 def _within(value: Value, low: float, high: float) -> Value:
