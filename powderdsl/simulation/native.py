@@ -57,7 +57,7 @@ SLICE = 0.25
 class ByWidth:
     """Native code for each width of grids (`known_width`), made for the first grid of that width.
 
-    Code is built with the current settings. `running` and `notes` describe the last width stepped.
+    Code is built with the current settings. `latest` is the program of the last width stepped.
 
     Args:
         segments: returns the ruleset on planes; the first call does the work.
@@ -79,7 +79,7 @@ class ByWidth:
         self._ruleset, self._segments, self._threads, self._how = ruleset, segments, threads, current()
         self._first, self._cells = first, cells
         self._programs: dict[int, Runnable] = {}
-        self._latest: Runnable | None = None
+        self.latest: Runnable | None = None
         try:
             code = recall(self._key())
         except NoCompiler as error:
@@ -89,7 +89,7 @@ class ByWidth:
         if code is None:
             segments()  # reports rules that cannot be lowered
         if first is not None:
-            self._latest = self.of(0 if code is None else code.width)
+            self.latest = self.of(0 if code is None else code.width)
 
     def of(self, width: int) -> Runnable:
         if width in self._programs:
@@ -147,18 +147,8 @@ class ByWidth:
             program = program.native
         return program if isinstance(program, NativeProgram) else None
 
-    @property
-    def running(self) -> str:
-        """The backend of the next step: ``wasm``, ``torch`` or ``native``."""
-        return str(getattr(self._latest, "running", "native"))
-
-    @property
-    def notes(self) -> tuple[str, ...]:
-        """Sentences that name the backends that ran, and the reasons."""
-        return tuple(getattr(self._latest, "notes", ()))
-
     def run(self, job: Job) -> Mapping[str, Array]:
-        self._latest = program = self.of(known_width(shape_of(job.state)[-1]))
+        self.latest = program = self.of(known_width(shape_of(job.state)[-1]))
         return program.run(job)
 
 
@@ -186,7 +176,8 @@ class AutoProgram:
         make: Callable[[], Runnable],
     ):
         self._name, self._first, self._large, self._make = name, first, large, make
-        self._native: Runnable | None = None
+        self.native: Runnable | None = None
+        """Native code, once it has been compiled."""
         self._problem = ""
         self._thread: threading.Thread | None = None
         self._starting = threading.Lock()
@@ -194,27 +185,22 @@ class AutoProgram:
         self._pace: tuple[int, float] | None = None  # cells of a batch, seconds per step on the first backend
         self._steps = {"first": 0, "native": 0}
         try:
-            self._native = recall()
+            self.native = recall()
         except NoCompiler as error:
             self._problem = str(error)
 
     @property
     def running(self) -> str:
         """The backend of the next step: ``wasm``, ``torch`` or ``native``."""
-        return self._name if self._native is None else "native"
-
-    @property
-    def native(self) -> Runnable | None:
-        """Native code, once it has been compiled."""
-        return self._native
+        return self._name if self.native is None else "native"
 
     @property
     def notes(self) -> tuple[str, ...]:
         """Sentences that name the backends that ran, and the reasons."""
         thread, first = self._thread, f"{self._name} for {self._steps['first']} steps"
-        if self._native is not None and thread is None:
+        if self.native is not None and thread is None:
             return ("native: it was compiled before",)
-        if self._native is not None:
+        if self.native is not None:
             return (f"{first} while native was made ready, then native for {self._steps['native']}",)
         if self._problem:
             return f"{self._name}: {self._problem}", f"native code is faster: {INSTALL}"
@@ -224,9 +210,9 @@ class AutoProgram:
 
     def run(self, job: Job) -> Mapping[str, Array]:
         if job.timing is not None:
-            return (self._native or self._first()).run(job)
+            return (self.native or self._first()).run(job)
         cells = prod(shape_of(job.state))
-        while self._native is None:
+        while self.native is None:
             count, clock = self._slice(cells, job.steps), job.clock
             began = time.perf_counter()
             try:
@@ -242,7 +228,7 @@ class AutoProgram:
                 return state
             job = job._replace(state=state, clock=clock._replace(since=clock.since + count), steps=left)
         self._steps["native"] += job.steps
-        return (self._native or self._large()).run(job)
+        return (self.native or self._large()).run(job)
 
     def _slice(self, cells: int, left: int) -> int:
         """The number of steps to run on the first backend before the next check: 1 until their speed is known."""
@@ -272,7 +258,7 @@ class AutoProgram:
             return
         with self._starting:
             # A forked child has its parent's memory, but not its threads: there, the thread has ended without a result.
-            finished = self._native is not None or bool(self._problem)
+            finished = self.native is not None or bool(self._problem)
             if not finished and (self._thread is None or not self._thread.is_alive()):
                 context = copy_context()
                 self._thread = threading.Thread(target=context.run, args=(self._compile,), daemon=True)
@@ -280,7 +266,7 @@ class AutoProgram:
 
     def _compile(self) -> None:
         try:
-            self._native = self._make()
+            self.native = self._make()
         except NoCompiler as error:
             self._problem = str(error)
         except Exception as error:  # the first backend continues; `--backend native` shows the error

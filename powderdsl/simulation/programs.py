@@ -167,12 +167,17 @@ def _wasm_problem() -> str:
 
 
 class BackendProgram(NamedTuple):
-    """The programs of one backend. `name` is the running backend, unless `whole` has `running` and `notes`."""
+    """The programs of one backend. `name` is the running backend, unless `latest` has `running` and `notes`."""
 
     name: str
     whole: Runnable
     rest: Callable[[], Runnable] | None = None
     """Returns the program for selected passes and given draws, if `whole` cannot run them."""
+
+    @property
+    def latest(self) -> Any:
+        """The program that ran last, of those by width."""
+        return getattr(self.whole, "latest", None)
 
     def run(self, job: Job) -> Mapping[str, Array]:
         if self.rest is None or (job.passes is None and not job.draws):

@@ -257,14 +257,14 @@ class Simulator:
     @property
     def running(self) -> str:
         """The backend of the next step: for ``auto`` on the CPU, ``wasm`` (or ``torch``) or ``native``."""
-        return str(getattr(self._program.whole, "running", self._program.name))
+        return str(getattr(self._program.latest, "running", self._program.name))
 
     @property
     def notes(self) -> tuple[str, ...]:
         """Sentences that name the backends that ``auto`` ran, and the reasons."""
         if self.backend == "auto" and self.running == "wasm" and self.kind.xp.__name__ != "torch":
             return ("wasm: native code takes torch and more work, or --backend native",)
-        return tuple(getattr(self._program.whole, "notes", ()))
+        return tuple(getattr(self._program.latest, "notes", ()))
 
     def native(self, width: int) -> NativeProgram | None:
         """Return the native code for grids of a width that runs all passes, if it has been compiled."""
