@@ -277,10 +277,8 @@ PIPELINE: tuple[Stage, ...] = (
 )  # fmt: skip
 
 
-def run_passes(program: Program, until: str | None = None) -> Program:
-    """The optimized program; `until` names the last stage to run. Tests verify it after each stage."""
+def run_passes(program: Program) -> Program:
+    """The optimized program. Tests verify it after each stage."""
     for stage in PIPELINE:
         program = replace(program, passes=tuple(map(stage.run, program.passes)))
-        if stage.name == until:
-            break
     return program
