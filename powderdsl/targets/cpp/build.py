@@ -94,21 +94,15 @@ ARCHITECTURE = "POWDERDSL_ARCH"
 """The environment variable that names another processor to compile for, such as ``x86-64-v3``."""
 
 
-def flags_for(compiler: Compiler, level: str, machine: str = "", features: str = "") -> tuple[str, ...]:
-    """The flags for a library of generated code.
+def flags_for(compiler: Compiler, level: str) -> tuple[str, ...]:
+    """The flags for a library of generated code. `level`: ``-O0`` to ``-O3``.
 
-    Args:
-        level: ``-O0`` to ``-O3``.
-        machine, features: of the processor, as `platform.machine` and `processor` return them; this machine's if empty.
-
-    Raises:
-        NoCompiler: `$POWDERDSL_ARCH` is not a name.
+    Raises NoCompiler if `$POWDERDSL_ARCH` is not a name.
 
     Floats keep their meaning at every level: no contraction (a·b + c is rounded twice on every machine) and no fast
     mathematics, so that all backends agree bit for bit.
     """
-    machine, features = machine or platform.machine(), features or processor()
-    on_x86 = machine in ("x86_64", "AMD64", "i686")
+    on_x86 = platform.machine() in ("x86_64", "AMD64", "i686")
     name = os.environ.get(ARCHITECTURE, "native")
     if not re.fullmatch(r"[A-Za-z0-9_.+-]+", name):
         raise NoCompiler(f"no C++ compiler: ${ARCHITECTURE} is `{name}`, which names no processor")
@@ -116,7 +110,7 @@ def flags_for(compiler: Compiler, level: str, machine: str = "", features: str =
         name = name.replace("-", "_")
     flags = ["-std=c++17", level, f"-march={name}" if on_x86 else f"-mcpu={name}"]
     flags += ["-ffp-contract=off", "-fno-math-errno", "-fno-trapping-math", "-fno-strict-aliasing"]
-    if on_x86 and ("avx512f" in features if name == "native" else name.endswith("v4")):
+    if on_x86 and ("avx512f" in processor() if name == "native" else name.endswith("v4")):
         flags.append("-mprefer-vector-width=512")
     if compiler.family == "gcc":
         # on such long functions, these two take most of the time for no benefit
