@@ -335,13 +335,13 @@ class Chunks(CellValues[Value]):
     def draw(self, node: Node) -> Value:
         stream, bits = node.attr
         keys = self.memory.at("keys", self.memory.layout.streams[stream])
-        loop = self.loop
+        loop, draw = self.loop, self.library.module.once("draw_float", self.library.draw_float)
         y = body.let((loop.row - loop.lane) // self.memory.row)
         at = body.let(self.library.word_number(loop.at - loop.lane, y))
         numbers = body.let(0, "v128")
         for i in range(CHUNK):
             within = (loop.column + i) & (WORD - 1)
-            number = self.library.draw_float()(at, loop.lane, within, keys, bits)
+            number = draw(at, loop.lane, within, keys, bits)
             numbers.set(op("f32x4.replace_lane", numbers, number, tail=bytes([i])))
         return numbers
 

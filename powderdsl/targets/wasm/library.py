@@ -447,11 +447,8 @@ class Library:
                 y += 1
         return plane
 
-    def draw_float(self) -> Callee:
-        """A draw of a cell as float32: number of the word, lane in bytes, column in the word, keys, bits."""
-        return self.module.once("draw_float", self._draw_float)
-
-    def _draw_float(self, at: I32, lane: I32, column: I32, keys: I32, bits: I32) -> Value:
+    def draw_float(self, at: I32, lane: I32, column: I32, keys: I32, bits: I32) -> Value:
+        """A draw of a cell as float32, in the word numbered `at`: lane in bytes, column in the word."""
         number = body.let(self.first_number(at, keys))
         total = body.let(0, "i64")
         scratch = const("i32", self.memory.at("limits"))

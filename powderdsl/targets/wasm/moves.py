@@ -45,14 +45,11 @@ def rows_that_move(library: Library, downwards: bool) -> Callee:
     return library.module.once("rows_down" if downwards else "rows_up", rows)
 
 
-def mover(library: Library, kind: str, offset: Offset, leaves: Leftover) -> Callee:
-    """Moves planes: those of movers and targets, the end of the list of rows, the end of the table of planes."""
-    name = f"{kind}_{offset[0]}_{offset[1]}_{leaves}"
-    return library.module.once(name, _Mover(library, kind, offset, leaves).write)
-
-
 class _Mover:
-    """Writes a function that moves planes, some of them together."""
+    """Writes a function that moves planes, some of them together.
+
+    Its arguments: the planes of movers and targets, the end of the list of rows, the end of the table of planes.
+    """
 
     def __init__(self, library: Library, kind: str, offset: Offset, leaves: Leftover):
         self.library, self.memory, self.kind, self.leaves = library, library.memory, kind, leaves
@@ -154,7 +151,9 @@ def move_groups(
                 end += 4
                 if kind == "everything":
                     plane[SOME] = 1
-        body.do(mover(library, move.op, move.offset, kind)(movers, entered, rows, end))
+        code = _Mover(library, move.op, move.offset, kind)
+        name = f"{move.op}_{code.dy}_{code.dx}_{kind}"
+        body.do(library.module.once(name, code.write)(movers, entered, rows, end))
     body.do(library.give(entered))
 
 
