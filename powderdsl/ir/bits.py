@@ -608,8 +608,6 @@ def segments(
     parts = []
     slots = program.slots
     forms = [choose_form(program, pass_) for pass_ in program.passes]
-    if not forms:
-        return (Segment(program, lower_bits(program)),)
     for packed, group in groupby(forms, lambda form: form.planes is not None):
         run = tuple(group)
         part = replace(program, slots=slots, passes=tuple(form.cells for form in run))
@@ -617,4 +615,4 @@ def segments(
         planes = replace(part, slots=plane_slots(slots), passes=passes)
         parts.append(Segment(part, planes if packed else None))
         slots = tuple(replace(slot, resets=False) for slot in program.slots)
-    return tuple(parts)
+    return tuple(parts) or (Segment(program, lower_bits(program)),)

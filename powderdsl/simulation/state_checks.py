@@ -69,14 +69,18 @@ def checked_values(
         raise TypeError(f"{slot.name} takes floats, found {array.dtype}")
     if slot.is_real and not bool(kind.xp.isfinite(array).all()):
         raise ValueError(f"{slot.name} has values that are not finite")
-    convert = _floats if slot.is_real else _integers
+    xp = kind.xp
     prop = ruleset.property(slot.name)
     limited = slot.of if prop is None else prop.stored
     out = kind.zeros(slot.dtype, tuple(array.shape))
     step = max(1, CHUNK // max(1, out.shape[0] * out.shape[-1]))
     for start in range(0, out.shape[-2], step):
         rows = slice(start, start + step)
-        values = convert(kind, array[..., rows, :], slot, ruleset)
+        if slot.is_real:
+            values = xp.clip(xp.asarray(array[..., rows, :], dtype=xp.float32), slot.kind.lo, slot.kind.hi)
+            values = xp.where(xp.abs(values) < SNAP, 0, values)
+        else:
+            values = _integers(kind, array[..., rows, :], slot, ruleset)
         out[..., rows, :] = values
         if limited is None:
             continue
@@ -86,12 +90,6 @@ def checked_values(
             names = ", ".join(element.name for element in ruleset.elements if element.id in limited)
             raise ValueError(f"{slot.name} can only differ from its default in cells of: {names}")
     return out
-
-
-def _floats(kind: ArrayKind, array: Array, slot: Slot, ruleset: Ruleset) -> Array:
-    xp = kind.xp
-    values = xp.clip(xp.asarray(array, dtype=xp.float32), slot.kind.lo, slot.kind.hi)
-    return xp.where(xp.abs(values) < SNAP, 0, values)
 
 
 def _integers(kind: ArrayKind, array: Array, slot: Slot, ruleset: Ruleset) -> Array:
