@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
 from functools import partial, reduce
@@ -21,7 +21,6 @@ from powderdsl.ir.ops import (
     SubstepGraph,
     Threshold,
     Type,
-    component_names,
     integer,
     kernel_rows,
     single,
@@ -317,7 +316,7 @@ LIVE_BUDGET = 100_000
 
 def part_names(name: str, kind: Kind) -> tuple[str, ...]:
     """The IR slots of a state array: one, or one for each component of a vector."""
-    return component_names(name) if kind.name == "vec2" else (name,)
+    return (f"{name}.row", f"{name}.column") if kind.name == "vec2" else (name,)
 
 
 def ir_type(kind: Kind, ids: int = 256) -> Type:
@@ -338,9 +337,25 @@ def slot_parts(slot: Slot, ruleset: Ruleset) -> tuple[SlotType, ...]:
     ])  # fmt: skip
 
 
+def state_slots(ruleset: Ruleset) -> list[SlotType]:
+    """The IR slots of a state; the first is the element's."""
+    return [part for slot in slots(ruleset) for part in slot_parts(slot, ruleset)]
+
+
+def program_of(ruleset: Ruleset, slots: Iterable[SlotType], passes: Iterable[PassGraph]) -> Program:
+    """A program with the parameters and streams of a ruleset."""
+    return Program(
+        ruleset.name,
+        tuple(slots),
+        tuple((p.name, p.kind.name) for p in ruleset.params),
+        tuple((s.name, s.ident, s.bits) for s in ruleset.streams),
+        tuple(passes),
+    )
+
+
 def lower_ruleset(ruleset: Ruleset) -> Program:
     """All passes of a ruleset, one graph each."""
-    slot_types = [part for slot in slots(ruleset) for part in slot_parts(slot, ruleset)]
+    slot_types = state_slots(ruleset)
     # The range of a slot that starts each step at its default grows from pass to pass.
     ranges = {
         s.name: integer(int(s.default), int(s.default))
@@ -354,21 +369,16 @@ def lower_ruleset(ruleset: Ruleset) -> Program:
             if name in ranges:
                 ranges[name] = integer(min(ranges[name].lo, last.type.lo), max(ranges[name].hi, last.type.hi))
         passes.append(graph)
-    return Program(
-        ruleset.name,
-        tuple(slot_types),
-        tuple((p.name, p.kind.name) for p in ruleset.params),
-        tuple((s.name, s.ident, s.bits) for s in ruleset.streams),
-        tuple(passes),
-    )
+    return program_of(ruleset, slot_types, passes)
 
 
-def lower_condition(ruleset: Ruleset, condition: Expr) -> PassGraph:
-    """A condition as a pass that writes the slot `condition`."""
+def lower_values(ruleset: Ruleset, values: Mapping[str, Expr], lets: Iterable[str] = ()) -> PassGraph:
+    """Expressions as a pass that writes a slot for each. `lets`: names of flags, slots too, that `let` may read."""
     build = Graph()
-    parts = [part for slot in slots(ruleset) for part in slot_parts(slot, ruleset)]
-    inputs = Inputs(ruleset, build, {part.name: build.input(part.name, part.type) for part in parts})
-    return PassGraph("condition", "", (), (("condition", node(condition, inputs)),))
+    inputs = {part.name: build.input(part.name, part.type) for part in state_slots(ruleset)}
+    inputs |= {f"let {name}": build.input(name, FLAG) for name in lets}
+    at = Inputs(ruleset, build, inputs)
+    return PassGraph("values", "", (), tuple((name, node(value, at)) for name, value in values.items()))
 
 
 def live_passes(ruleset: Ruleset) -> tuple[Pass, ...]:

@@ -393,19 +393,6 @@ class SlotType:
         return tuple(plane_name(self.name, i) for i in range(self.type.bits))
 
 
-def component_names(name: str) -> tuple[str, str]:
-    """The slots of a vector."""
-    return f"{name}.row", f"{name}.column"
-
-
-def component_of(slot: str) -> tuple[str, int | None]:
-    """The vector that a slot is a component of, and which; the slot itself and None for any other."""
-    for i, end in enumerate(component_names("")):
-        if slot.endswith(end):
-            return slot.removesuffix(end), i
-    return slot, None
-
-
 def plane_name(slot: str, bit: int) -> str:
     """The slot of a bit of an integer slot."""
     return f"{slot}:{bit}"

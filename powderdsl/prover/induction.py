@@ -9,7 +9,7 @@ from itertools import chain
 
 from powderdsl.compiler import lower
 from powderdsl.ir.bits import lower_pass
-from powderdsl.ir.lower import lower_condition
+from powderdsl.ir.lower import lower_values
 from powderdsl.ir.ops import REAL, Node, Offset, PassGraph, Program, needed, nodes_of
 from powderdsl.model.state import slots
 from powderdsl.model.types import Bounded, Claim, Local, Never, Ruleset, Symmetric, Total, Unchanging
@@ -244,7 +244,7 @@ class Prover:
 
     def _condition(self, claim: Never) -> Node:
         """The condition of a claim on bit planes."""
-        graph = lower_pass(self.program, lower_condition(self.ruleset, claim.condition))
+        graph = lower_pass(self.program, lower_values(self.ruleset, {"condition": claim.condition}))
         if _reads_clock(graph):  # it changes from step to step, not from pass to pass
             raise Undecided("the clock")
         ((_, condition),) = graph.outputs

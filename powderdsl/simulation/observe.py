@@ -15,8 +15,8 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from powderdsl.ir.lower import ir_type, part_names
-from powderdsl.ir.ops import component_of
+from powderdsl.ir.lower import slot_parts
+from powderdsl.ir.ops import REAL, SlotType
 from powderdsl.model.state import Slot, property_dtype, property_values, slots
 from powderdsl.model.types import Ruleset
 from powderdsl.simulation.draw import looks, rgb
@@ -51,6 +51,9 @@ class Observer:
         self.ruleset = ruleset
         self.device = torch.empty(0, device=device).device  # with its number
         self.slots: dict[str, Slot] = {slot.name: slot for slot in slots(ruleset)}
+        parts = ((slot, slot_parts(slot, ruleset)) for slot in self.slots.values())
+        self._parts = {part.name: (part, slot) for slot, own in parts for part in own}
+        """The slots of the IR, and the arrays of the state that hold them."""
         self._views: dict[tuple[str, int, int], tuple[NativeProgram, Views]] = {}
         """By kind, number of cells and bytes per pixel, for the program that ran last."""
 
@@ -82,7 +85,8 @@ class Observer:
         ids = state["element"].flatten().int()
         for at, channel in enumerate(channels):
             if channel.read:
-                out[:, at] = _component(state, channel.slot)
+                part, _ = self._parts[channel.slot]
+                out[:, at] = part.of(state[part.state])
             else:
                 out[:, at] = tables[at].index_select(0, ids).view(batch, height, width)
         return out
@@ -94,8 +98,8 @@ class Observer:
         out = self.buffer(out, (batch, len(self._coded), height, width), torch.uint8)
         if isinstance(state, PackedState):
             return self._show("compact", state, out)
-        for at, (name, slot) in enumerate(self._coded):
-            _write_codes(state, slot, name, out[:, at])
+        for at, (part, slot) in enumerate(self._coded):
+            _write_codes(state, slot, part, out[:, at])
         return out
 
     @torch.no_grad()
@@ -131,8 +135,8 @@ class Observer:
                 rows = [_native_channel(channel, at, homes) for at, channel in enumerate(channels)]
                 views.add("channels", len(rows), tables=[torch.tensor(rows, dtype=torch.int32), tables])
             case "compact":
-                for at, (name, slot) in enumerate(self._coded):
-                    numbers = homes[name]
+                for at, (part, slot) in enumerate(self._coded):
+                    numbers = homes[part.name]
                     if _is_small(slot):
                         views.add("values", *numbers, 1, int(slot.kind.lo) & 255, offset=at * cells)
                     else:
@@ -153,7 +157,7 @@ class Observer:
     @cached_property
     def compact_names(self) -> tuple[str, ...]:
         """The names of the channels of `compact`: ``element``, fields, ``name.row`` and ``name.column``."""
-        return tuple(name for name, _ in self._coded)
+        return tuple(part.name for part, _ in self._coded)
 
     @cached_property
     def compact_values(self) -> Tensor:
@@ -183,25 +187,18 @@ class Observer:
     @property
     def plane_names(self) -> tuple[str, ...]:
         """The names of the planes: a flag's name, or ``name:bit`` for integers."""
-        flags = {slot.name for slot in self.slots.values() if slot.kind.name == "flag"}
-        return tuple(name if name in flags else f"{name}:{bit}" for name, bit in self._bits)
+        return tuple(name for part, _ in self._parts.values() if part.type != REAL for name in part.planes)
 
     @cached_property
-    def _coded(self) -> tuple[tuple[str, Slot], ...]:
-        """The channels of `compact`: names, and the slots that they encode, which a step does not restart."""
-        lasting = [slot for slot in self.slots.values() if not slot.resets]
-        return tuple((name, slot) for slot in lasting for name in part_names(slot.name, slot.kind))
+    def _coded(self) -> tuple[tuple[SlotType, Slot], ...]:
+        """The channels of `compact`: those of `_parts` that a step does not restart."""
+        return tuple((part, slot) for part, slot in self._parts.values() if not slot.resets)
 
     @cached_property
     def _bits(self) -> tuple[tuple[str, int], ...]:
         """The slot and bit of each plane: flags and integers, slot by slot, lowest bit first. Floats have none."""
-        bits: list[tuple[str, int]] = []
-        for slot in self.slots.values():
-            if not slot.is_real:
-                type = ir_type(slot.kind, self.ruleset.slots)
-                count = 1 if type.name == "flag" else type.bits
-                bits += [(slot.name, bit) for bit in range(count)]
-        return tuple(bits)
+        stored = [part for part, _ in self._parts.values() if part.type != REAL]
+        return tuple((part.name, bit) for part in stored for bit in range(len(part.planes)))
 
     @cached_property
     def _looks(self) -> dict[str, Any]:
@@ -251,12 +248,6 @@ def _write_slot(state: State, name: str, out: Tensor) -> Tensor:
     return out.copy_(state[name])
 
 
-def _component(state: State, name: str) -> Tensor:
-    """A slot [B, H, W], or one component of a vector."""
-    vector, component = component_of(name)
-    return state[name] if component is None else state[vector][:, component]
-
-
 def _native_channel(
     channel: Channel, number: int, homes: Mapping[str, tuple[int, int, bool]]
 ) -> tuple[int, int, int, int]:
@@ -269,15 +260,15 @@ def _native_channel(
     return (2, slot, bits, number) if channel.one_hot is None else (1, slot, bits, channel.one_hot)
 
 
-def _write_codes(state: State, slot: Slot, name: str, out: Tensor) -> None:
-    """Write the codes uint8 [B, H, W] of a slot, or of its component `name`: see `_code_values`."""
+def _write_codes(state: State, slot: Slot, part: SlotType, out: Tensor) -> None:
+    """Write the codes uint8 [B, H, W] of a slot, or of a part of a vector: see `_code_values`."""
     if _is_small(slot):
         _write_slot(state, slot.name, out.view(getattr(torch, slot.dtype)))
         if slot.kind.lo:
             out -= int(slot.kind.lo) & 255  # in eight bits, that is +
         return
     floor = _floor(slot)
-    value = (_component(state, name) if slot.planes == 2 else state[name]).to(torch.float32)
+    value = part.of(state[slot.name]).to(torch.float32)
     zero = torch.tensor(floor, device=out.device).view(torch.int32)
     size = ((value.abs() + floor).view(torch.int32) - zero + (1 << (SHIFT - 1))) >> SHIFT
     out.copy_(128 + torch.where(value < 0, -size, size))

@@ -11,10 +11,9 @@ import torch
 from torch import Tensor
 
 from powderdsl.ir.bits import NotBits, lower_bits, plane_slots
-from powderdsl.ir.lower import Inputs, ir_type, lower_expression, part_names
-from powderdsl.ir.ops import FLAG, Graph, Node, PassGraph, Program, SlotType, Type, component_of, plane_name
+from powderdsl.ir.lower import lower_values, program_of, state_slots
+from powderdsl.ir.ops import FLAG, Graph, Node, Program, SlotType, plane_name
 from powderdsl.ir.stages import run_passes
-from powderdsl.model.state import slots
 from powderdsl.model.types import Expr, Ruleset
 from powderdsl.simulation.simulator import World
 from powderdsl.targets.cpp.counts import CellCounts, Counted
@@ -78,7 +77,7 @@ class Meter:
         self._counts: tuple[Places, CellCounts | None] | None = None
         values = [(number, measure) for number, measure in enumerate(measures) if measure.value is not None]
         self._cells = _Cells(ruleset, values, size, device) if values else None
-        self._bits = range(_types(ruleset)["element"].bits)
+        self._bits = range(state_slots(ruleset)[0].type.bits)
         """Of element ids."""
         named = {measure.region for measure in measures if measure.region is not None}
         self._regions = sorted(named | {name.removeprefix(REGION_LET) for name in _lets(measures)})
@@ -240,15 +239,6 @@ class Meter:
         return total
 
 
-def _types(ruleset: Ruleset) -> dict[str, Type]:
-    """The slots that cell expressions read, by name."""
-    return {
-        name: ir_type(slot.kind, ruleset.slots)
-        for slot in slots(ruleset)
-        for name in part_names(slot.name, slot.kind)
-    }
-
-
 def _lets(measures: Sequence[Measure]) -> list[str]:
     """The regions that cell expressions name."""
     exprs = [measure.value for measure in measures if measure.value is not None]
@@ -257,21 +247,12 @@ def _lets(measures: Sequence[Measure]) -> list[str]:
 
 def _lowered(ruleset: Ruleset, measures: Sequence[tuple[int, Measure]]) -> Program:
     """The cell expressions of numbered measures as a program of one pass, with an output for each: ``measure 3``."""
-    build = Graph()
-    types, regions = _types(ruleset), _lets([measure for _, measure in measures])
-    state = {name: build.input(name, type) for name, type in types.items()}
-    state |= {f"let {name}": build.input(name, FLAG) for name in regions}
-    outputs = []
-    for number, measure in measures:
-        assert measure.value is not None
-        (node,) = lower_expression(measure.value, Inputs(ruleset, build, state))
-        outputs.append((f"measure {number}", node))
-    every = {**types, **dict.fromkeys(regions, FLAG), **{name: node.type for name, node in outputs}}
-    rows = [SlotType(name, type, 0, False) for name, type in every.items()]
-    params = tuple((p.name, p.kind.name) for p in ruleset.params)
-    streams = tuple((s.name, s.ident, s.bits) for s in ruleset.streams)
-    graph = PassGraph("measures", ruleset.name, (), tuple(outputs))
-    return run_passes(Program(ruleset.name, tuple(rows), params, streams, (graph,)))
+    regions = _lets([measure for _, measure in measures])
+    values = {f"measure {i}": measure.value for i, measure in measures if measure.value is not None}
+    graph = lower_values(ruleset, values, regions)
+    others = {**dict.fromkeys(regions, FLAG), **{name: node.type for name, node in graph.outputs}}
+    rows = [*state_slots(ruleset), *(SlotType(name, type, 0, False) for name, type in others.items())]
+    return run_passes(program_of(ruleset, rows, [graph]))
 
 
 class _Cells:
@@ -283,8 +264,7 @@ class _Cells:
         self.ruleset, self.size, self.device = ruleset, size, device
         self.numbers = [number for number, _ in measures]
         source, name, constants = pass_source(_lowered(ruleset, measures).passes[0], 0)
-        self.types = _types(ruleset)
-        self.slots = [name for name in self.types if f"state[{name!r}]" in source]
+        self.slots = [slot for slot in state_slots(ruleset) if f"state[{slot.name!r}]" in source]
         self.regions = _lets([measure for _, measure in measures])
         self.run: PassFunction = compiled(source, name, constants, device)
 
@@ -300,10 +280,8 @@ class _Cells:
         none = torch.zeros(0, dtype=torch.int64, device=self.device)
         kernels = Kernels((len(world), *self.size), self.device, every, {}, {}, none, none, world.step)
         planes: dict[str, Tensor] = {}
-        for name in self.slots:
-            vector, component = component_of(name)
-            plane = world.state[name] if component is None else world.state[vector][:, component]
-            planes[name] = plane.to(DTYPES[self.types[name].name])
+        for slot in self.slots:
+            planes[slot.name] = slot.of(world.state[slot.state]).to(DTYPES[slot.type.name])
         for name in self.regions:
             planes[name] = regions[name.removeprefix(REGION_LET)]
         cells = self.run(kernels, planes)
