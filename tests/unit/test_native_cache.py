@@ -386,6 +386,7 @@ def test_kernels_for_gpus_lie_there_too(tmp_path: Path, monkeypatch: pytest.Monk
     compile_text = Mock(side_effect=lambda compiler, text, options: text.encode())
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     monkeypatch.setattr(cuda_program, "nvrtc", Mock())
+    monkeypatch.setattr(cache, "QUICK", -1)
     monkeypatch.setattr(cuda_program, "compile_text", compile_text)
     a, b = (
         KernelSource("rules", text, Layout(), group=1, threads=32, shared=0, scratch=0) for text in ("a", "b")

@@ -8,10 +8,8 @@ from __future__ import annotations
 
 import ctypes
 import glob
-import hashlib
 import sys
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
 from functools import cache, reduce
 from pathlib import Path
 from typing import Any
@@ -21,7 +19,7 @@ from torch import Tensor
 
 from powderdsl.ir.bits import Segment
 from powderdsl.ir.ops import REAL, Program
-from powderdsl.system import cache as native_cache
+from powderdsl.system.cache import persistent
 from powderdsl.targets.cuda.source import KernelSource, cuda_source
 from powderdsl.targets.job import Job, Like, PackedArrays, Runnable, like_of, shape_of, unavailable
 from powderdsl.targets.layout import pieces
@@ -92,25 +90,14 @@ def check(code: int, what: str) -> None:
 def machine_code(source: KernelSource, architecture: str, version: str) -> bytes:
     """A kernel's machine code, from the cache or newly compiled.
 
-    Safe with other processes doing the same: files are added atomically. Raises NoCuda if NVRTC is missing or failed,
-    or there is no folder for the cache.
+    Raises NoCuda if NVRTC is missing or failed.
     """
     compiler = nvrtc(version)
     major, minor = ctypes.c_int(), ctypes.c_int()
     compiler.nvrtcVersion(ctypes.byref(major), ctypes.byref(minor))
     options = (f"--gpu-architecture={architecture}", *OPTIONS)
     key = "\0".join([source.text, f"{major.value}.{minor.value}", *options])
-    try:
-        folder = native_cache.compiled_folder()
-    except OSError as error:
-        raise NoCuda(f"no cache folder: {error}") from None
-    name = hashlib.sha256(key.encode()).hexdigest()[:32]
-    if (path := native_cache.find(folder, name)) is not None:
-        return path.read_bytes()
-    code = compile_text(compiler, source.text, options)
-    with suppress(OSError):
-        native_cache.add(folder, name, code, f"{source.name}.cuda")
-    return code
+    return persistent(f"{source.name}.cuda", key, lambda: compile_text(compiler, source.text, options))
 
 
 def compile_text(compiler: ctypes.CDLL, text: str, options: Sequence[str]) -> bytes:
