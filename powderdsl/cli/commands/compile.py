@@ -16,7 +16,7 @@ from powderdsl.model.types import Ruleset
 
 if TYPE_CHECKING:
     from powderdsl.ir.bits import Segment
-    from powderdsl.ir.ops import Program
+    from powderdsl.ir.ops import PassGraph, Program
 
 STAGES = ("tree", "model", "ir", "planes", "schedule", "kernels")
 
@@ -105,22 +105,23 @@ SHOWN_WIDTH, SHOWN_SHARED = 64, 227 << 10
 def _kernels(program: Program, backend: str, pass_name: str | None) -> Iterator[str]:
     """The generated source of a backend; in parts if some passes cannot run on bit planes."""
     from powderdsl.ir.bits import segments
-    from powderdsl.targets.torch.source import kernel_source
+    from powderdsl.targets.torch import planes, source
+
+    def shown(part: Program) -> list[tuple[PassGraph, int]]:
+        return [(pass_, i) for i, pass_ in enumerate(part.passes) if pass_name in (None, pass_.name)]
 
     if backend == "reference":
         raise BadInput("the reference backend runs the checked model: it has no kernels")
     if backend in ("native", "cuda") and pass_name is not None:
         raise BadInput(f"{backend} source is one text: --pass cannot be used with it")
     if backend == "torch-cells":
-        yield kernel_source(program, pass_name)
+        yield from (source.pass_source(*pass_)[0] for pass_ in shown(program))
         return
     for part in segments(program):
         if part.planes is None:
-            yield kernel_source(part.program, pass_name)
+            yield from (source.pass_source(*pass_)[0] for pass_ in shown(part.program))
         elif backend in ("torch", "torch-fused"):
-            from powderdsl.targets.torch.planes import planes_source
-
-            yield planes_source(part.planes, pass_name)
+            yield from (planes.pass_source(part.planes, *pass_).text for pass_ in shown(part.planes))
         elif backend == "native":
             from powderdsl.targets.cpp.source import native_source
 

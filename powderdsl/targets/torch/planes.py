@@ -46,12 +46,6 @@ def pass_source(program: Program, pass_: PassGraph, number: int) -> PassSource:
     return PassSource("\n".join(text), name, tuple(writer.inputs))
 
 
-def planes_source(program: Program, only: str | None = None) -> str:
-    """The generated source of all passes on bit planes (or one), as `--emit kernels` prints it."""
-    passes = enumerate(program.passes)
-    return "\n\n".join(pass_source(program, p, i).text for i, p in passes if only is None or p.name == only)
-
-
 @dataclass
 class _Line:
     """A statement ``name = text``. `op` names an operation that creates a tensor or may overwrite an argument."""

@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping
 from typing import Any
 from zlib import crc32
 
-from powderdsl.ir.ops import Node, PassGraph, Program, nodes_of
+from powderdsl.ir.ops import Node, PassGraph, nodes_of
 from powderdsl.ir.text import infix
 
 _QUOTED = re.compile(r"'[^']*'")
@@ -151,10 +151,3 @@ def load_source(source: str, name: str, constants: Mapping[str, object]) -> Call
     namespace: dict[str, Any] = dict(constants)
     exec(compile(source, filename, "exec"), namespace)
     return namespace[name]
-
-
-def kernel_source(program: Program, only: str | None = None) -> str:
-    """The generated source of all passes (or one), as `--emit kernels` prints it."""
-    return "\n\n".join(
-        pass_source(p, i)[0] for i, p in enumerate(program.passes) if only is None or p.name == only
-    )
