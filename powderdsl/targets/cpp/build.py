@@ -20,7 +20,6 @@ from functools import lru_cache
 from importlib.util import find_spec
 from pathlib import Path
 from tempfile import TemporaryFile
-from typing import Any
 
 # Imported here, not later: a fork while another thread imports it would leave the child waiting forever.
 from filelock import FileLock, Timeout
@@ -240,16 +239,13 @@ def run_compilers(scratch: Path, *commands: list[str]) -> tuple[int, str]:
     """
     processes: list[subprocess.Popen[bytes]] = []
     with TemporaryFile() as messages:
-        # In new sessions, so that the programs that g++ starts end with it.
-        options: dict[str, Any] = {
-            "stdin": subprocess.DEVNULL,
-            "stdout": subprocess.DEVNULL,
-            "stderr": messages,
-        }
-        options |= {"env": {**os.environ, "TMPDIR": str(scratch), "LC_ALL": "C"}, "start_new_session": True}
+        env, nothing = {**os.environ, "TMPDIR": str(scratch), "LC_ALL": "C"}, subprocess.DEVNULL
         try:
             for command in commands:
-                process = subprocess.Popen(command, **options)
+                # In new sessions, so that the programs that g++ starts end with it.
+                process = subprocess.Popen(
+                    command, stdin=nothing, stdout=nothing, stderr=messages, env=env, start_new_session=True
+                )
                 processes.append(process)
                 _running.append(process)
             # Without a limit, waiting holds a lock, and a forked child would wait for the compilers too.
