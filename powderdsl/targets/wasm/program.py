@@ -124,20 +124,19 @@ class Instance:
             first, apart = (0, 1) if piece.component is None else (piece.component, 2)
             yield *numbers_of(piece, self.layout, size), at + first * plane, apart * plane
 
-    def new(self, worlds: int, rows: int) -> int:
-        """A batch of zeros."""
+    def new(self, state: Mapping[str, Array]) -> int:
+        """A batch of zeros of a state's shape."""
+        worlds, rows, _ = shape_of(state)
         free = self._free[worlds]
         return free.pop() if free else self.call("allocate", worlds, rows, self.width)
 
     def copy(self, state: WasmState) -> int:
-        worlds, rows, _ = shape_of(state)
-        batch = self.new(worlds, rows)
+        batch = self.new(state)
         self.call("copy", state.handle, batch)
         return batch
 
     def pack(self, state: Mapping[str, Array]) -> int:
-        worlds, rows, _ = shape_of(state)
-        batch = self.new(worlds, rows)
+        batch = self.new(state)
         for name, array in state.items():
             value = self.kind.contiguous(array)
             if self.kind.holds_any(value):  # a new batch holds zeros

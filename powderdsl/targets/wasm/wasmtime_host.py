@@ -8,7 +8,7 @@ import os
 from contextlib import suppress
 from functools import cache
 from hashlib import sha256
-from typing import Any, TypeVar
+from typing import Any
 from weakref import WeakSet
 
 import wasmtime
@@ -26,13 +26,6 @@ GROWTH = 16 << 20
 
 _OWNED: WeakSet[Any] = WeakSet()
 """Python objects that own memory of wasmtime."""
-T = TypeVar("T")
-
-
-def _keep_alive(owner: T) -> T:
-    """The same object, remembered in `_OWNED`."""
-    _OWNED.add(owner)
-    return owner
 
 
 @atexit.register
@@ -50,7 +43,9 @@ def _engine(*, reserve: bool) -> wasmtime.Engine:
         config.memory_reservation = 0
         config.memory_reservation_for_growth = GROWTH
         config.memory_guard_size = 0
-    return _keep_alive(wasmtime.Engine(config))
+    engine = wasmtime.Engine(config)
+    _OWNED.add(engine)
+    return engine
 
 
 class WasmtimeModule:
@@ -79,7 +74,8 @@ class WasmtimeModule:
             module = wasmtime.Module.deserialize(self.engine, machine_code)
         except wasmtime.WasmtimeError:  # made by another processor
             module = wasmtime.Module(self.engine, self._code)
-        self._module = _keep_alive(module)
+        _OWNED.add(module)
+        self._module = module
 
     def __call__(self) -> WasmtimeInstance:
         """A new instance. Raises MemoryError where there is no room for its memory."""
@@ -98,7 +94,8 @@ class WasmtimeInstance:
     """An instance in its own store."""
 
     def __init__(self, engine: wasmtime.Engine, module: wasmtime.Module):
-        self._store = _keep_alive(wasmtime.Store(engine))
+        self._store = wasmtime.Store(engine)
+        _OWNED.add(self._store)
         instance = wasmtime.Instance(self._store, module, [])
         exports: dict[str, Any] = dict(instance.exports(self._store).items())
         self._context = self._store._context()
