@@ -44,11 +44,9 @@ def _pass_lines(pass_: PassGraph) -> list[str]:
         label = f" ({step.label})" if step.label else ""
         lines.append(f"  substep {number}{label}" + (f"  # {step.place}" if step.place else ""))
         for slot, node in step.writes:
-            reference = show(node)
-            lines.append(f"    write {slot} = {reference}")
+            lines.append(f"    write {slot} = {show(node)}")
     for slot, node in pass_.outputs:
-        reference = show(node)
-        lines.append(f"  leave {slot} = {reference}")
+        lines.append(f"  leave {slot} = {show(node)}")
     return lines
 
 

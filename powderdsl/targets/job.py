@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from copy import copy
 from typing import Any, NamedTuple, Protocol, Self
 
 from powderdsl.diagnostics import CompileError
@@ -127,11 +128,8 @@ class OwnedBatch(PackedArrays):
         self._arrays.clear()
         return handle
 
-    def __copy__(self) -> Self:
-        raise NotImplementedError
-
     def __deepcopy__(self, memo: Any) -> Self:
-        return self.__copy__()
+        return copy(self)
 
 
 def like_of(state: Mapping[str, Array]) -> Like:
