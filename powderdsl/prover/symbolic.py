@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 from typing import Any, Protocol
 
 from powderdsl.ir.lower import draws_below
-from powderdsl.ir.ops import OPS, REAL, Node, Offset, Program, Threshold, integer, plane_name
+from powderdsl.ir.ops import OPS, REAL, Node, Offset, Program, Threshold, integer
 from powderdsl.model.state import Slot, fresh_values, slots
 from powderdsl.model.types import Ruleset
 from powderdsl.prover.net import FALSE, TRUE, Literal, Net
@@ -148,15 +148,13 @@ class Layout:
 
 def layouts(ruleset: Ruleset, program: Program) -> dict[str, Layout]:
     """The slots of flags and integers by name, that of elements first."""
-    types = {slot.name: slot.type for slot in program.slots}
+    parts = {part.name: part for part in program.slots}
     rows = {}
     for slot in slots(ruleset):
         if slot.is_real:
             continue
-        type, prop = types[slot.name], ruleset.property(slot.name)
-        names: tuple[str, ...] = (slot.name,)
-        if type.name == "int":
-            names = tuple(plane_name(slot.name, i) for i in range(type.bits))
+        names, type = parts[slot.name].planes, parts[slot.name].type
+        prop = ruleset.property(slot.name)
         usual: list[int | None] = [*map(int, fresh_values(ruleset, slot))]
         if prop is not None:
             usual = [None if isinstance(value, str) else usual[i] for i, value in enumerate(prop.values)]

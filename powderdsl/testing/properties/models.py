@@ -7,8 +7,7 @@ from dataclasses import replace
 from math import lcm
 
 from powderdsl.arrays import np
-from powderdsl.ir.lower import ir_type
-from powderdsl.ir.ops import plane_name
+from powderdsl.ir.lower import slot_parts
 from powderdsl.model.state import Slot, fitting, slots
 from powderdsl.model.types import Ruleset
 from powderdsl.prover.questions import Model
@@ -92,12 +91,12 @@ def _batch(
 
 def _number(slot: Slot, ruleset: Ruleset, bits: Mapping[str, bool]) -> int | None:
     """The value of a slot in a cell of the model; None if it says nothing about it."""
-    type = ir_type(slot.kind, ruleset.slots)
-    names = [slot.name] if type.name != "int" else [plane_name(slot.name, i) for i in range(type.bits)]
+    part, *_ = slot_parts(slot, ruleset)
+    names = part.planes
     if not any(name in bits for name in names):
         return None
     number = sum(bits.get(name, False) << i for i, name in enumerate(names))
-    return number - (1 << len(names)) if type.signed and number >> (len(names) - 1) else number
+    return number - (1 << len(names)) if part.type.signed and number >> (len(names) - 1) else number
 
 
 def _params(model: Model, ruleset: Ruleset) -> dict[str, Array]:
