@@ -38,7 +38,7 @@ from powderdsl.diagnostics import CompileError, Diagnostic, Severity
 from powderdsl.model.types import Ruleset
 from powderdsl.tasks.shipped import load_task_with_diagnostics
 from powderdsl.testing.pack_tests.runner import run_examples
-from powderdsl.worlds.scene import load_start
+from powderdsl.worlds.scene import draw_start, find_scene
 
 ROOT = Path(__file__).resolve().parents[1]
 DOCS = ROOT / "docs"
@@ -114,7 +114,7 @@ def run_yaml(block: Block) -> None:
         return
     if scene := re.search(r"^scene: *(\S+)$", text, re.MULTILINE):
         Path(f"{scene[1]}.yaml").write_text(text, encoding="utf-8")
-        load_start(f"{scene[1]}.yaml", load(block.expected("with")))
+        draw_start(find_scene(f"{scene[1]}.yaml"), load(block.expected("with")))
         return
     name = re.search(r"^(?:pack|ruleset): *(\w+)", text, re.MULTILINE)
     assert name, "the block names no pack"

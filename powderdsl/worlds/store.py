@@ -22,7 +22,7 @@ from powderdsl.system.writing import failure, replacing
 from powderdsl.worlds.ascii import load_ascii
 from powderdsl.worlds.image import read_image
 from powderdsl.worlds.raster import MAX_CELLS, Size
-from powderdsl.worlds.scene import Start, load_start
+from powderdsl.worlds.scene import Start, draw_start, find_scene
 
 FORMAT = 1
 SLOT, IDS = "slot_", "slot_element"
@@ -83,7 +83,7 @@ def load_world(
 
     Raises:
         CompileError: PD602 if the file is not a world; PD603 or PD604 if the ruleset lacks one of its elements or fields;
-            PD607 if it has more than MAX_CELLS cells; what `load_start` raises.
+            PD607 if it has more than MAX_CELLS cells; what `find_scene` and `draw_start` raise.
         TypeError: `sim` is not a simulator.
         ValueError: `size`, `batch` or `seed` is given for a saved world, or `size` for a picture.
     """
@@ -123,7 +123,7 @@ def drawn_world(name: str, ruleset: Ruleset, size: Size | None) -> Start:
             raise failure("PD602", f"unknown kind of world file: {name}", helps=(KINDS,))
         if re.search(r"\.[A-Za-z0-9]{1,5}\Z", name):
             raise failure("PD601", f"no world {name}", helps=(KINDS,))
-    return load_start(name, ruleset, size=size)
+    return draw_start(find_scene(name), ruleset, size=size)
 
 
 def fresh_world(sim: Simulator, start: Start, seed: int) -> World:

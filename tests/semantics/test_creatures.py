@@ -18,7 +18,7 @@ import powderdsl
 from powderdsl.simulation.draw import to_numpy
 from powderdsl.simulation.simulator import Simulator, World
 from powderdsl.worlds.ascii import read_ascii
-from powderdsl.worlds.scene import load_start
+from powderdsl.worlds.scene import draw_start, find_scene
 
 PAGE = Path(__file__).parents[2] / "docs" / "creatures.md"
 CREATURES = ("fish", "bird", "kangaroo", "mole", "lemming", "snake", "robot")
@@ -186,7 +186,7 @@ def test_robots_stay_where_they_land() -> None:
 
 def test_cloners_pour_out_creatures_and_moles_and_snakes_eat_theirs() -> None:
     sim = simulator()
-    start = load_start("hatchery", sim.ruleset)
+    start = draw_start(find_scene("hatchery"), sim.ruleset)
     world = sim.world(np.repeat(start.ids[None], 2, 0), seed=0)
     for name, field in start.fields.items():
         world = sim.paint(world, where=field.where, **{name: field.values})

@@ -11,7 +11,7 @@ import powderdsl
 from powderdsl.compiler import load_with_diagnostics, whole_palette
 from powderdsl.simulation.tracing import trace
 from powderdsl.testing.pack_tests.runner import run_examples
-from powderdsl.worlds.scene import load_start
+from powderdsl.worlds.scene import draw_start, find_scene
 from powderdsl.worlds.store import load_world, save
 from tests.refusals import refusal, refused_codes
 
@@ -341,7 +341,7 @@ def test_scenes_and_traces_take_qualified_fields() -> None:
     )
     for order in (("one", "two"), ("two", "one")):
         rules = powderdsl.load("core", *(f"{name}.yaml" for name in order))
-        start = load_start("scene.yaml", rules)
+        start = draw_start(find_scene("scene.yaml"), rules)
         fields = {name: field.values.tolist() for name, field in start.fields.items()}
         mine, other = ("wet", "two.wet") if order[0] == "one" else ("one.wet", "wet")
         assert (fields[mine][0], fields[other][1]) == ([4, 4], [6, 6])

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import powderdsl
-from powderdsl.worlds.scene import load_start
+from powderdsl.worlds.scene import draw_start, find_scene
 from tests.cli.commands import powderdsl as command
 from tests.refusals import refusal
 from tests.unit.elements import RULES
@@ -23,7 +23,7 @@ def written(tmp_path: Path, *statements: str) -> Path:
 
 
 def fields(tmp_path: Path, *statements: str):
-    return load_start(written(tmp_path, *statements), RULES).fields
+    return draw_start(find_scene(written(tmp_path, *statements)), RULES).fields
 
 
 def test_fields_are_set_in_shapes(tmp_path):
@@ -89,7 +89,7 @@ def test_a_run_starts_with_the_fields_of_its_scene(tmp_path):
     ],
 )
 def test_a_bad_setting(tmp_path, statement, code, under):
-    (found,) = refusal(load_start, written(tmp_path, statement), RULES)
+    (found,) = refusal(fields, tmp_path, statement)
     assert found.code == code
     assert under is None or found.primary.span.text == under
 

@@ -17,7 +17,7 @@ from powderdsl.targets.array_kind import ArrayKind
 from powderdsl.targets.wasm.source import wasm_module
 from powderdsl.tasks.shipped import load_task
 from powderdsl.tasks.tensors.generator import StartWorlds
-from powderdsl.worlds.scene import load_start
+from powderdsl.worlds.scene import draw_start, find_scene
 from powderdsl.worlds.store import load_world, save
 from powderdsl.worlds.strewn import strew
 
@@ -64,7 +64,7 @@ Path("hashes").write_text("".join(hashes))
 save(world, "world.npz")
 again = sim.step(load_world("world.npz", sim), 5, params={"water.melt": 0.5}, passes=sim.passes[::2])
 Path("world.npz").unlink()
-drawn = load_start("garden", model, size=(40, 70)).ids
+drawn = draw_start(find_scene("garden"), model, size=(40, 70)).ids
 scattered = strew(model, (33, 20), 2, 7)
 painted = sim.paint(sim.world(scattered), where=scattered > 2, element="sand", velocity=(1, 2.5))
 made = StartWorlds(load_task("sort-sand-and-stone"), "train", ArrayKind()).make(np.array([5, 9], np.int64))

@@ -15,6 +15,6 @@
 `draw` may also be a `|` block, one statement a line. A file with several scenes has a list under `scenes`.
 """
 
-from powderdsl.worlds.scene.read import Start, draw_start, find_scene, load_start, shipped_scenes
+from powderdsl.worlds.scene.read import Start, draw_start, find_scene, shipped_scenes
 
-__all__ = ["Start", "draw_start", "find_scene", "load_start", "shipped_scenes"]
+__all__ = ["Start", "draw_start", "find_scene", "shipped_scenes"]

@@ -218,21 +218,8 @@ class Start:
     fields: Mapping[str, FieldValues]
 
 
-def load_start(path_or_name: str | Path, ruleset: Ruleset, *, size: Size | None = None) -> Start:
-    """The start world of a scene.
-
-    Args:
-        path_or_name: a file, ``FILE#NAME`` for one of several scenes, or a shipped scene's name.
-        size: (rows, columns) instead of the scene's. Shapes keep their cells; frames and open ends follow the edge.
-
-    Raises:
-        CompileError: the errors of `find_scene` and `draw_start`.
-    """
-    return draw_start(find_scene(path_or_name), ruleset, size=size)
-
-
 def find_scene(path_or_name: str | Path) -> Scene:
-    """A scene from a file, or a shipped one by name, as in `load_start`.
+    """A scene: from a file, ``FILE#NAME`` for one of several in it, or a shipped one by its name.
 
     Raises CompileError: PD601 for an unknown name, PD101 or PD102 for a file that cannot be read, or mistakes in the
     file.
@@ -292,6 +279,7 @@ def _checked_scenes(source: Source) -> tuple[Scene, ...]:
 def draw_start(scene: Scene, ruleset: Ruleset, *, size: Size | None = None) -> Start:
     """The start world of a scene.
 
+    `size`, (rows, columns), replaces the scene's: shapes keep their cells; frames and open ends follow the edge.
     Statements run in order. A field is set in the cells of its shape whose element can have it; painting an element
     later resets the fields there. Raises CompileError for unknown elements (PD604) or fields (PD301), values of another
     kind (PD110) or out of range (PD402), settings that no cell can have (PD608), a bad `size` (PD607).
