@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from powderdsl.arrays import NDArray, np
-from powderdsl.diagnostics import Reporter, Source, Span, suggest
+from powderdsl.diagnostics import Reporter, Span, suggest
 from powderdsl.model.types import Element
 from powderdsl.syntax.sources import read_source
 from powderdsl.system.writing import failure
@@ -65,26 +65,18 @@ def parse_ascii(
     return np.frombuffer(text.encode("latin-1"), dtype=np.uint8).reshape(len(rows), -1).copy()
 
 
-def read_ascii(text: str, elements: Sequence[Element], *, name: str = "<drawing>") -> NDArray[np.uint8]:
-    """The ids uint8 [H, W] of a drawing, called `name` in messages. Raises CompileError as `parse_ascii` reports."""
+def load_ascii(path: str | Path, elements: Sequence[Element]) -> NDArray[np.uint8]:
+    """The ids uint8 [H, W] of a text file. Raises CompileError as `parse_ascii` reports; PD101, PD102 if it cannot be read."""
     reporter = Reporter()
-    ids = parse_ascii(Span(Source(name, text), 0, len(text)), elements, reporter)
+    source = read_source(Path(path), reporter, limit=MAX_BYTES)
+    ids = parse_ascii(Span(source, 0, len(source.text)), elements, reporter) if source else None
     reporter.raise_if_errors()
     assert ids is not None
     return ids
 
 
-def load_ascii(path: str | Path, elements: Sequence[Element]) -> NDArray[np.uint8]:
-    """The ids uint8 [H, W] of a text file. Raises CompileError as `read_ascii`; PD101, PD102 if it cannot be read."""
-    reporter = Reporter()
-    source = read_source(Path(path), reporter, limit=MAX_BYTES)
-    reporter.raise_if_errors()
-    assert source is not None
-    return read_ascii(source.text, elements, name=source.name)
-
-
 def write_ascii(ids: Any, elements: Sequence[Element]) -> str:
-    """Rows of characters for ids [H, W], each with a line break. `read_ascii` is the inverse."""
+    """Rows of characters for ids [H, W], each with a line break. `load_ascii` reads them back."""
     characters = {number: character for character, number in _characters(elements, {}).items()}
     return "".join("".join(map(characters.__getitem__, row)) + "\n" for row in ids.tolist())
 

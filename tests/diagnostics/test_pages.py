@@ -42,9 +42,9 @@ from powderdsl.testing.properties.search import quick_results, refuted
 from powderdsl.worldmodel import training
 from powderdsl.worldmodel.config import DataConfig, Machine, TrainConfig
 from powderdsl.worldmodel.networks import custom_network
-from powderdsl.worlds.ascii import read_ascii
 from powderdsl.worlds.image import read_image
 from powderdsl.worlds.scene import draw_start, find_scene
+from tests.drawings import read_ascii
 from tests.refusals import refusal
 from tests.semantics.test_mixed import spread
 

@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 import powderdsl
 from powderdsl.simulation.draw import to_numpy
 from powderdsl.simulation.simulator import Simulator, World
-from powderdsl.worlds.ascii import read_ascii
 from powderdsl.worlds.scene import draw_start, find_scene
+from tests.drawings import read_ascii
 
 PAGE = Path(__file__).parents[2] / "docs" / "creatures.md"
 CREATURES = ("fish", "bird", "kangaroo", "mole", "lemming", "snake", "robot")

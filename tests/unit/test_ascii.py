@@ -10,7 +10,8 @@ from hypothesis.extra.numpy import array_shapes, arrays
 
 from powderdsl.diagnostics import CompileError, Reporter, Source, Span
 from powderdsl.worlds import ascii as ascii_art
-from powderdsl.worlds.ascii import load_ascii, parse_ascii, read_ascii, write_ascii
+from powderdsl.worlds.ascii import load_ascii, parse_ascii, write_ascii
+from tests.drawings import read_ascii
 from tests.refusals import refusal
 from tests.unit.elements import ELEMENTS
 
