@@ -101,6 +101,12 @@ def fresh_values(ruleset: Ruleset, slot: Slot) -> list[Any]:
     return values if slot.is_real else [*map(int, values)]
 
 
+def holders(ruleset: Ruleset, slot: Slot) -> frozenset[int] | None:
+    """The elements whose cells can have a value other than the default; None for all."""
+    prop = ruleset.property(slot.name)
+    return slot.of if prop is None else prop.stored
+
+
 def scratch_slots(pass_: Pass) -> dict[str, Slot]:
     """The slots of a pass's scratch fields by name. They exist only during the pass and are not stored."""
     return {

@@ -15,7 +15,7 @@ from typing import Any, Protocol
 
 from powderdsl.ir.lower import draws_below
 from powderdsl.ir.ops import OPS, REAL, Node, Offset, Program, Threshold, integer
-from powderdsl.model.state import Slot, fresh_values, slots
+from powderdsl.model.state import Slot, fresh_values, holders, slots
 from powderdsl.model.types import Ruleset
 from powderdsl.prover.net import FALSE, TRUE, Literal, Net
 from powderdsl.prover.solver import OutOfWork
@@ -158,8 +158,8 @@ def layouts(ruleset: Ruleset, program: Program) -> dict[str, Layout]:
         usual: list[int | None] = [*map(int, fresh_values(ruleset, slot))]
         if prop is not None:
             usual = [None if isinstance(value, str) else usual[i] for i, value in enumerate(prop.values)]
-        holders = prop.stored if prop is not None else slot.of
-        rows[slot.name] = Layout(slot, names, type.signed, type.lo, type.hi, tuple(usual), holders or None)
+        own = holders(ruleset, slot) or None
+        rows[slot.name] = Layout(slot, names, type.signed, type.lo, type.hi, tuple(usual), own)
     return rows
 
 

@@ -13,6 +13,7 @@ from powderdsl.model.state import (
     Slot,
     fits,
     fresh_values,
+    holders,
     qualified_slots,
     size_problem,
     slots,
@@ -74,7 +75,6 @@ def standalone_module(ruleset: Ruleset, size: tuple[int, int], memo: Memo | None
 
 
 def _stored(slot: Slot, ruleset: Ruleset, parts: tuple[SlotType, ...]) -> Stored:
-    prop = ruleset.property(slot.name)
     usual = fresh_values(ruleset, slot)
     number = float if slot.dtype == "float32" else int
     by_component = zip(*usual, strict=True) if slot.planes == 2 else [usual]
@@ -86,7 +86,7 @@ def _stored(slot: Slot, ruleset: Ruleset, parts: tuple[SlotType, ...]) -> Stored
         tuple(tuple(map(number, values)) for values in by_component),
         float(low),
         float(high),
-        prop.stored if prop is not None else slot.of,
+        holders(ruleset, slot),
         slot.travels,
         slot.kind.name == "element",
     )

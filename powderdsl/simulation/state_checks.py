@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping
 from typing import Any
 
 from powderdsl.diagnostics import with_suggestion
-from powderdsl.model.state import SNAP, Slot, slots, stored_range
+from powderdsl.model.state import SNAP, Slot, holders, slots, stored_range
 from powderdsl.model.types import Param, Ruleset
 from powderdsl.targets.array_kind import Array, ArrayKind
 
@@ -70,8 +70,7 @@ def checked_values(
     if slot.is_real and not bool(kind.xp.isfinite(array).all()):
         raise ValueError(f"{slot.name} has values that are not finite")
     xp = kind.xp
-    prop = ruleset.property(slot.name)
-    limited = slot.of if prop is None else prop.stored
+    limited = holders(ruleset, slot)
     out = kind.zeros(slot.dtype, tuple(array.shape))
     step = max(1, CHUNK // max(1, out.shape[0] * out.shape[-1]))
     for start in range(0, out.shape[-2], step):

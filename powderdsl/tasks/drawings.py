@@ -9,7 +9,7 @@ from pathlib import Path
 from powderdsl.arrays import NDArray, np
 from powderdsl.diagnostics import CompileError, Reporter, Span, suggest
 from powderdsl.model.schema import Entry, Reader, first_line, keyed
-from powderdsl.model.state import slot_name, slots
+from powderdsl.model.state import holders, slot_name, slots
 from powderdsl.model.types import Element, Expr, Ruleset
 from powderdsl.syntax import yaml_tree
 from powderdsl.syntax.parse import Syntax, line_of
@@ -31,7 +31,7 @@ from powderdsl.worlds.ascii import ids_by_name, load_ascii, parse_ascii
 from powderdsl.worlds.image import read_image
 from powderdsl.worlds.raster import Setting, Shape, Size, mask
 from powderdsl.worlds.scene import draw_start, find_scene
-from powderdsl.worlds.scene.read import covers_nothing, not_a_statement, owners_of, shipped_scene, value_of
+from powderdsl.worlds.scene.read import covers_nothing, not_a_statement, shipped_scene, value_of
 from powderdsl.worlds.scene.statements import (
     RANGES,
     Statement,
@@ -318,7 +318,7 @@ class Drawer:
         ids = ids_by_name(self.ruleset.elements)
         parts = value_of(setting, known, ids, self.ruleset, self.reporter)
         slot = known.get(setting.name)
-        return FieldValue(slot, parts, owners_of(slot, self.ruleset)) if slot and parts else None
+        return FieldValue(slot, parts, holders(self.ruleset, slot)) if slot and parts else None
 
     def covers_something(self, statement: Statement, amounts: tuple[Expr | None, ...]) -> bool:
         """Return True if the shape can cover a cell; otherwise, report it."""

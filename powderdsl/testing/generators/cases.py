@@ -9,7 +9,7 @@ from random import Random
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from powderdsl.arrays import np
-from powderdsl.model.state import SNAP, Slot, fitting, fresh_values, slots
+from powderdsl.model.state import SNAP, Slot, fitting, fresh_values, holders, slots
 from powderdsl.model.types import Kind, Ruleset
 
 if TYPE_CHECKING:
@@ -158,9 +158,8 @@ def fresh(ruleset: Ruleset, slot: Slot, ids: Array) -> Array:
 
 def holding(ruleset: Ruleset, slot: Slot, ids: Array) -> Array:
     """bool, as `ids`: the cells whose element may have its own value in a slot."""
-    prop = ruleset.property(slot.name)
-    holders = slot.of if prop is None else prop.stored
-    return np.ones(ids.shape, bool) if holders is None else np.isin(ids, sorted(holders))
+    some = holders(ruleset, slot)
+    return np.ones(ids.shape, bool) if some is None else np.isin(ids, sorted(some))
 
 
 def clamped_to_holders(ruleset: Ruleset, slot: Slot, values: Array, ids: Array) -> Array:

@@ -13,7 +13,7 @@ from typing import Any
 from powderdsl.arrays import NDArray, np
 from powderdsl.diagnostics import Label, Reporter, Source, Span, suggest
 from powderdsl.model.schema import NAME_FORM, Reader, Record, first_line, keyed, read_tree
-from powderdsl.model.state import Slot, slot_name, slots
+from powderdsl.model.state import Slot, holders, slot_name, slots
 from powderdsl.model.types import Ruleset
 from powderdsl.syntax import yaml_tree
 from powderdsl.syntax.parse import Syntax, line_of
@@ -326,7 +326,7 @@ def draw_start(scene: Scene, ruleset: Ruleset, *, size: Size | None = None) -> S
                 if slot_of[name].travels:
                     field.where[cells] = False
             continue
-        owners = owners_of(slot_of[paint.name], ruleset)
+        owners = holders(ruleset, slot_of[paint.name])
         if owners is not None:
             cells = cells & np.isin(drawn, sorted(owners))
         if not cells.any():
@@ -338,12 +338,6 @@ def draw_start(scene: Scene, ruleset: Ruleset, *, size: Size | None = None) -> S
         fields[paint.name].where[cells] = True
     reporter.raise_if_errors()
     return Start(drawn, fields)
-
-
-def owners_of(slot: Slot, ruleset: Ruleset) -> frozenset[int] | None:
-    """The elements whose cells can have a value other than the default; None for all."""
-    prop = ruleset.property(slot.name)
-    return slot.of if prop is None else prop.stored
 
 
 def value_of(
