@@ -13,14 +13,31 @@ import torch
 from torch import Tensor
 
 from powderdsl.tasks.episodes import Episodes, TaskProgram, compile_task
+from powderdsl.tasks.goals import measures_in, scalars_of
 from powderdsl.tasks.players import ExpertPlayer
-from powderdsl.tasks.shipped import load_task
-from powderdsl.web.playable import WORLDS, playable, played_split
+from powderdsl.tasks.shipped import load_task, shipped_tasks
+from powderdsl.tasks.task import Task
+from powderdsl.web.playable import WORLDS, played_split
 from powderdsl.web.site import PAGE
 
 PLAYS = 16
 
+KNOWN = {"element", "member", "let", "and", "or", "not", "const"}
+"""Operations on cells that depend only on their element."""
+
 Player = Callable[[Episodes], Tensor | None]
+
+
+def playable() -> tuple[str, ...]:
+    """The shipped tasks with a goal that depends on counts of elements, under rules that the page has or makes."""
+    return tuple(name for name in shipped_tasks() if is_playable(load_task(name)))
+
+
+def is_playable(task: Task) -> bool:
+    split, values = played_split(task), [measure.value for measure in measures_in(scalars_of(task.goal))]
+    alike = not split.params and all(len(rules) == 1 for rules in (task.rules, *split.rulesets))
+    known = all(value is not None and {part.op for part in value.walk()} <= KNOWN for value in values)
+    return alike and known and (task.goal.each is not None or task.goal.final is not None)
 
 
 def returns(program: TaskProgram, worlds: Tensor, player: Player) -> Tensor:

@@ -15,12 +15,13 @@ from powderdsl.simulation.simulator import Simulator, World
 from powderdsl.simulation.simulator import compile as compile_rules
 from powderdsl.targets.cpp.program import NativeProgram, PackedState
 from powderdsl.tasks.file import task_under
+from powderdsl.tasks.goals import measures_in, scalars_of
 from powderdsl.tasks.laws import Laws
 from powderdsl.tasks.shipped import check_split, load_task
 from powderdsl.tasks.task import Task
 from powderdsl.tasks.tensors.actions import CLOCK, Hands, put_rows, put_worlds
 from powderdsl.tasks.tensors.generator import StartWorlds
-from powderdsl.tasks.tensors.measures import Masks, Meter, ScalarInputs, measures_in, scalar_value, scalars_of
+from powderdsl.tasks.tensors.measures import Masks, Meter, ScalarInputs, scalar_value
 
 __all__ = ["Episodes", "TaskProgram", "check_actions", "compile_task", "load_task"]
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from functools import reduce
 from itertools import pairwise
@@ -14,7 +14,7 @@ from powderdsl.model.expressions.typer import Typer
 from powderdsl.model.operations import COMPARISONS
 from powderdsl.model.types import FLAG, REAL, Expr
 from powderdsl.syntax.parse import Syntax
-from powderdsl.tasks.task import Measure
+from powderdsl.tasks.task import Goal, Measure
 
 MEASURES = {
     "count": "count(CELLS in REGION)",
@@ -238,3 +238,14 @@ def parts_of(scalar: Expr) -> list[Expr]:
         parts.append(part)
         stack += part.args
     return parts
+
+
+def scalars_of(goal: Goal) -> list[Expr]:
+    """Every part of a goal's expressions."""
+    scalars = [scalar for scalar in (goal.each, goal.final, goal.success, goal.failure) if scalar is not None]
+    return [part for scalar in scalars for part in parts_of(scalar)]
+
+
+def measures_in(scalars: Iterable[Expr]) -> tuple[Measure, ...]:
+    """Every measure among parts of expressions, once."""
+    return tuple(dict.fromkeys(part.value for part in scalars if part.op == "measure"))

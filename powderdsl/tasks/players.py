@@ -7,10 +7,10 @@ from torch import Tensor
 
 from powderdsl.system.random import action_keys, uniforms
 from powderdsl.tasks.episodes import Episodes, TaskProgram
-from powderdsl.tasks.goals import parts_of
+from powderdsl.tasks.goals import measures_in, parts_of
 from powderdsl.tasks.mixed import MixedEpisodes
 from powderdsl.tasks.task import ExpertMove
-from powderdsl.tasks.tensors.measures import Meter, ScalarInputs, measures_in, scalar_value
+from powderdsl.tasks.tensors.measures import Meter, ScalarInputs, scalar_value
 from powderdsl.worlds.raster import mask
 
 SIMULATED = 1024

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import base64
 import re
-from functools import cache
+from collections.abc import Sequence
 from typing import Any
 
 from powderdsl.arrays import np
@@ -13,8 +13,8 @@ from powderdsl.model.types import Expr
 from powderdsl.syntax.sources import shipped
 from powderdsl.targets.array_kind import ArrayKind
 from powderdsl.tasks.file import task_under
-from powderdsl.tasks.goals import REGION_LET, parts_of
-from powderdsl.tasks.shipped import load_task, shipped_tasks
+from powderdsl.tasks.goals import REGION_LET, measures_in, scalars_of
+from powderdsl.tasks.shipped import load_task
 from powderdsl.tasks.task import BLOW, NO_CHANGE, Measure, Split, Task
 from powderdsl.tasks.tensors.generator import StartWorlds
 from powderdsl.worlds.store import world_data
@@ -22,36 +22,10 @@ from powderdsl.worlds.store import world_data
 WORLDS = 8
 """Number of start worlds of a task in the page: the first ones of `played_split`."""
 
-_KNOWN = {"element", "member", "let", "and", "or", "not", "const"}
-"""Operations on cells that depend only on their element."""
-
-
-@cache
-def playable() -> tuple[str, ...]:
-    """The shipped tasks with a goal that depends on counts of elements, under rules that the page has or makes."""
-    return tuple(name for name in shipped_tasks() if _is_playable(load_task(name)))
-
 
 def played_split(task: Task) -> Split:
     """The split of the worlds in the page: of tasks whose rules differ by world, rules that training does not show."""
     return task.split("test") if task.splits[0].rulesets else task.splits[0]
-
-
-def _is_playable(task: Task) -> bool:
-    split, values = played_split(task), [measure.value for measure in _measures(task)]
-    alike = not split.params and all(len(rules) == 1 for rules in (task.rules, *split.rulesets))
-    known = all(value is not None and {part.op for part in value.walk()} <= _KNOWN for value in values)
-    return alike and known and (task.goal.each is not None or task.goal.final is not None)
-
-
-def _goal(task: Task) -> dict[str, Expr]:
-    goal = {key: getattr(task.goal, key) for key in ("each", "final", "success", "failure")}
-    return {key: scalar for key, scalar in goal.items() if scalar is not None}
-
-
-def _measures(task: Task) -> list[Measure]:
-    parts = (part for scalar in _goal(task).values() for part in parts_of(scalar))
-    return list(dict.fromkeys(part.value for part in parts if part.op == "measure"))
 
 
 def task_data(name: str) -> dict[str, Any]:
@@ -60,7 +34,8 @@ def task_data(name: str) -> dict[str, Any]:
     Each of `starts` has its rules and what depends on them, such as the ids of elements.
     """
     task = load_task(name)
-    agent, split = task.agent, played_split(task)
+    agent, split, measures = task.agent, played_split(task), measures_in(scalars_of(task.goal))
+    goal = {key: getattr(task.goal, key) for key in ("each", "final", "success", "failure")}
     text = (shipped("tasks") / f"{name}.yaml").read_text(encoding="utf-8")
     lines = re.findall(r"^  ((?:each|final|success|failure): (?:.|\n    )*)$", text, re.MULTILINE)
     tasks = [task_under(task, rules) for rules in split.rulesets[:WORLDS]] or [task] * WORLDS
@@ -71,18 +46,25 @@ def task_data(name: str) -> dict[str, Any]:
         **{key: getattr(agent, key) for key in ("brush", "bins", "actions", "speed")},
         "steps": agent.steps_per_action,
         "free": agent.free_steps,
-        "goal": {key: _written(scalar, _measures(task)) for key, scalar in _goal(task).items()},
+        "goal": {key: _written(scalar, measures) for key, scalar in goal.items() if scalar is not None},
         "starts": [_start(task, split.name, number) for number, task in enumerate(tasks)],
     }
 
 
+def start_world(task: Task, split: str, number: int) -> tuple[Any, dict[str, Any]]:
+    """A start world of a split: as it is made, with its regions, and as JSON."""
+    made = StartWorlds(task, split, ArrayKind()).make(np.array([number], np.int64))
+    fields = {key: np.asarray(values)[0] for key, (values, _) in made.fields.items()}
+    return made, world_data(task.ruleset, np.asarray(made.ids)[0], fields, (number, 0, 0))
+
+
 def _start(task: Task, split: str, number: int) -> dict[str, Any]:
     """A start world, and what depends on its rules."""
-    rules, made = task.ruleset, StartWorlds(task, split, ArrayKind()).make(np.array([number], np.int64))
-    counted = [_counted(measure, [element.id for element in rules.elements]) for measure in _measures(task)]
+    rules, measures = task.ruleset, measures_in(scalars_of(task.goal))
+    made, world = start_world(task, split, number)
+    counted = [_counted(measure, [element.id for element in rules.elements]) for measure in measures]
     names = {BLOW: "blow", NO_CHANGE: "nothing"}
     names |= {element.id: element.qualified for element in rules.elements}
-    fields = {key: np.asarray(values)[0] for key, (values, _) in made.fields.items()}
     regions = {count[key] for count in counted for key in ("region", "let")} - {None}
     cells = {key: np.asarray(made.regions[key])[0].astype("uint8") for key in sorted(regions)}
     return {
@@ -90,7 +72,7 @@ def _start(task: Task, split: str, number: int) -> dict[str, Any]:
         "choices": [names[choice] for choice in task.agent.choices],
         "field": qualified_slots(rules).get(task.agent.speed_field or ""),
         "measures": counted,
-        "world": world_data(rules, np.asarray(made.ids)[0], fields, (number, 0, 0)),
+        "world": world,
         "regions": {key: base64.b64encode(values.tobytes()).decode() for key, values in cells.items()},
     }
 
@@ -116,7 +98,7 @@ def _holds(cell: Expr, element: int, inside: bool) -> Any:
     return not args[0] if cell.op == "not" else all(args) if cell.op == "and" else any(args)
 
 
-def _written(scalar: Expr, measures: list[Measure]) -> Any:
+def _written(scalar: Expr, measures: Sequence[Measure]) -> Any:
     """An expression as JSON: numbers, and lists of an operation and its arguments."""
     if scalar.op == "const":
         return float(scalar.value)

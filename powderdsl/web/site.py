@@ -39,11 +39,9 @@ from powderdsl.simulation.standalone import standalone_module
 from powderdsl.syntax.sources import shipped
 from powderdsl.system.cache import Memo, code_hash, persistent
 from powderdsl.system.writing import replacing
-from powderdsl.targets.array_kind import ArrayKind
 from powderdsl.tasks.shipped import load_task, shipped_tasks
-from powderdsl.tasks.tensors.generator import StartWorlds
 from powderdsl.universes import MAX_SEED, is_universe
-from powderdsl.web.playable import task_data
+from powderdsl.web.playable import start_world, task_data
 from powderdsl.worlds.raster import Size, mask
 from powderdsl.worlds.scene import draw_start, shipped_scenes
 from powderdsl.worlds.store import world_data
@@ -526,14 +524,12 @@ def _named(name: str, about: str, ruleset: Ruleset, ids: Any, fields: Any = None
 
 def task_worlds() -> dict[str, list[dict[str, Any]]]:
     """The first world of each shipped task's first split, by the rules of the tasks."""
-    kind = ArrayKind()
     worlds: dict[str, list[dict[str, Any]]] = {}
     for name in shipped_tasks():
         task = load_task(name)
-        starts = StartWorlds(task, task.splits[0].name, kind).make(np.array([0], np.int64))
-        fields = {name: np.asarray(values)[0] for name, (values, _) in starts.fields.items()}
-        world = _named(f"task {name}", task.about, task.ruleset, np.asarray(starts.ids)[0], fields)
-        worlds.setdefault("+".join(task.rules), []).append(world)
+        _, world = start_world(task, task.splits[0].name, 0)
+        named = {"name": f"task {name}", "about": task.about} | world
+        worlds.setdefault("+".join(task.rules), []).append(named)
     return worlds
 
 

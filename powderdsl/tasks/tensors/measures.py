@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -21,21 +21,10 @@ from powderdsl.targets.cpp.program import PackedState, Places
 from powderdsl.targets.tensor_kind import pack
 from powderdsl.targets.torch.program import DTYPES, Kernels, PassFunction, compiled
 from powderdsl.targets.torch.source import pass_source
-from powderdsl.tasks.goals import REGION_LET, parts_of
-from powderdsl.tasks.task import NOTHING, Goal, Measure
+from powderdsl.tasks.goals import REGION_LET
+from powderdsl.tasks.task import NOTHING, Measure
 from powderdsl.tasks.tensors.actions import put_rows
 from powderdsl.worlds.raster import Size
-
-
-def scalars_of(goal: Goal) -> list[Expr]:
-    """Every part of a goal's expressions."""
-    scalars = [scalar for scalar in (goal.each, goal.final, goal.success, goal.failure) if scalar is not None]
-    return [part for scalar in scalars for part in parts_of(scalar)]
-
-
-def measures_in(scalars: Iterable[Expr]) -> tuple[Measure, ...]:
-    """Every measure among parts of expressions, once."""
-    return tuple(dict.fromkeys(part.value for part in scalars if part.op == "measure"))
 
 
 @dataclass(frozen=True)
