@@ -10,7 +10,7 @@ import os
 import re
 import signal
 from collections import Counter
-from collections.abc import Collection, Generator, Iterable, Mapping, Sequence
+from collections.abc import Collection, Generator, Iterable, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import suppress
@@ -23,7 +23,7 @@ from pathlib import Path
 from string import ascii_letters
 from textwrap import indent
 from threading import Thread
-from typing import Any, ClassVar, Self
+from typing import Any
 
 import numpy as np
 
@@ -51,7 +51,7 @@ from powderdsl.testing.pack_tests.runner import ANYTHING, SEEDS, field_rows, run
 from powderdsl.testing.properties.comparison import Distinction, compare
 from powderdsl.testing.properties.outcomes import Property, Result
 from powderdsl.testing.properties.running import Runner, random_samples, run_sample
-from powderdsl.testing.properties.search import STEPS, InvariantSearch, SearchPlan
+from powderdsl.testing.properties.search import FEW, STEPS, InvariantSearch, SearchPlan
 
 Settings = tuple[tuple[str, str], ...]
 """Parameters and their values as text."""
@@ -130,7 +130,7 @@ class Original:
     @cached_property
     def broken(self) -> frozenset[str]:
         """The words of invariants that it breaks itself: what more packs change says nothing about a mutant."""
-        search = InvariantTrials.on(self.sim)
+        search = invariant_trials(self.sim)
         search.try_random()
         return frozenset(trial.prop.text for trial in search.trials if trial.sample is not None)
 
@@ -245,30 +245,26 @@ def failed_test(original: Original, sim: Simulator, pack: str, *phases: int) -> 
 # Invariants
 
 
-class InvariantTrials(InvariantSearch):
-    """Tries all invariants of a simulator's rules, proven or not, on the worlds that `powderdsl test` tries first."""
+def invariant_trials(sim: Simulator, without: Collection[str] = ()) -> InvariantSearch:
+    """A search that tries all invariants, proven or not, on the worlds that `powderdsl test` tries first.
 
-    few: ClassVar[Mapping[type, int]] = {**InvariantSearch.few, Local: PAIRED, Symmetric: PAIRED}
-
-    @classmethod
-    def on(cls, sim: Simulator, without: Collection[str] = ()) -> Self:
-        """The search, `without` some invariants by their words. What follows from the reach of rules is not tried.
-
-        Nor are mirrors of rules that draw: mirrored worlds may then only be alike in thousands of runs.
-        """
-        ruleset, trials = sim.ruleset, []
-        for prop in map(Property.of, ruleset.invariants):
-            claim = prop.claim
-            holds = isinstance(claim, Local) and horizon(ruleset) <= claim.radius
-            drawn = isinstance(claim, Symmetric) and ruleset.streams
-            if not holds and not drawn and prop.text not in without:
-                trials.append(Result(prop))
-        return cls(Runner(ruleset, sim=sim), SearchPlan(seconds=inf), trials)
+    `without`: the words of those to leave out. What follows from the reach of rules is not tried. Nor are mirrors of
+    rules that draw: mirrored worlds may then only be alike in thousands of runs.
+    """
+    ruleset, trials = sim.ruleset, []
+    for prop in map(Property.of, ruleset.invariants):
+        claim = prop.claim
+        holds = isinstance(claim, Local) and horizon(ruleset) <= claim.radius
+        drawn = isinstance(claim, Symmetric) and ruleset.streams
+        if not holds and not drawn and prop.text not in without:
+            trials.append(Result(prop))
+    few = {**FEW, Local: PAIRED, Symmetric: PAIRED}
+    return InvariantSearch(Runner(ruleset, sim=sim), SearchPlan(seconds=inf), trials, few)
 
 
 def broken_invariant(original: Original, sim: Simulator) -> Property | None:
     """An invariant of the mutant that some random world breaks."""
-    search = InvariantTrials.on(sim, original.broken)
+    search = invariant_trials(sim, original.broken)
     samples = random_samples(sim.ruleset, search.plan.seed, search.plan.examples) if search.trials else ()
     for sample, steps in zip(samples, cycle(STEPS), strict=False):
         search.try_sample(sample, steps)

@@ -96,15 +96,11 @@ class Result:
     difference: ScopeDifference | None = None
 
     @property
-    def is_proven(self) -> bool:
-        return bool(self.proof)
-
-    @property
     def status(self) -> str:
         """``proven``, ``tested``, ``untested``, ``broken`` or ``differs``."""
         if self.sample is not None:
             return "differs" if self.difference else "broken"
-        return "proven" if self.is_proven else "tested" if self.worlds else "untested"
+        return "proven" if self.proof else "tested" if self.worlds else "untested"
 
     @property
     def holds(self) -> bool:

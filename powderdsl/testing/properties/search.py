@@ -8,7 +8,7 @@ from functools import partial
 from itertools import chain
 from math import inf
 from time import monotonic
-from typing import Any, ClassVar, Self
+from typing import Any, Self
 
 from powderdsl.analysis.ledger import ledger
 from powderdsl.analysis.proofs import prove
@@ -63,6 +63,10 @@ class SearchPlan:
     """Seconds of work for proofs by induction, counted; 0 for none."""
 
 
+FEW: Mapping[type, int] = {Agreement: 2, Alike: 2, Never: 8}
+"""Batches for claims that are expensive to check: by the oracle, in many copies, over many steps."""
+
+
 @dataclass
 class InvariantSearch:
     """Tests the properties of one ruleset; worlds may be brought from outside too."""
@@ -70,9 +74,7 @@ class InvariantSearch:
     runner: Runs
     plan: SearchPlan
     trials: list[Result] = field(default_factory=list)
-
-    few: ClassVar[Mapping[type, int]] = {Agreement: 2, Alike: 2, Never: 8}
-    """Batches for claims that are expensive to check: by the oracle, in many copies, over many steps."""
+    few: Mapping[type, int] = field(default_factory=lambda: FEW)
 
     @classmethod
     def of(
@@ -126,11 +128,11 @@ class InvariantSearch:
     @property
     def undecided(self) -> list[Result]:
         """The trials of properties that are neither proven nor broken."""
-        return [trial for trial in self.trials if not trial.is_proven and trial.sample is None]
+        return [trial for trial in self.trials if not trial.proof and trial.sample is None]
 
     def only(self, texts: Collection[str]) -> Self:
         """The same search for some properties alone that are not proven."""
-        trials = [trial for trial in self.trials if not trial.is_proven and trial.prop.text in texts]
+        trials = [trial for trial in self.trials if not trial.proof and trial.prop.text in texts]
         return replace(self, trials=list(map(replace, trials)))
 
     def try_random(self) -> None:
@@ -206,7 +208,7 @@ class InvariantSearch:
                     search.try_sample(sample, world.steps)
             search.try_random()
             still = {trial.prop.text for trial in search.trials if trial.sample is not None}
-            proven = {trial.prop.text for trial in search.trials if trial.is_proven}
+            proven = {trial.prop.text for trial in search.trials if trial.proof}
             for trial, world in some:
                 if trial.prop.text not in still:
                     trial.reason = "which is proven" if trial.prop.text in proven else "as far as was tried"
