@@ -15,13 +15,10 @@ from powderdsl.model.state import slots
 from powderdsl.model.text import one_line
 from powderdsl.model.types import Pass, Ruleset, Substep, substeps
 from powderdsl.testing.generators.cases import Start
-from powderdsl.testing.pack_tests.runner import ExampleResult, start_of
+from powderdsl.testing.pack_tests.runner import MOST, ExampleResult, start_of
 from powderdsl.testing.properties.breaks import Agreement, Alike, Tested, breaks, is_paired
 from powderdsl.testing.properties.outcomes import Counterexample, Property
 from powderdsl.testing.properties.running import MARK, Oracle, Runner, rule_spans, with_line_marks
-
-MOST = 8
-"""Added packs that are left out in turn, to see which of them matter."""
 
 
 def culprits(claim: Tested, ruleset: Ruleset, sample: Start, steps: int) -> tuple[Span, ...]:
