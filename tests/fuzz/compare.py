@@ -78,9 +78,18 @@ def assert_same(
             if difference is not None:
                 names = " and ".join(sim.backend for sim in simulators)
                 problem = f"{names} differ after step {step}: {difference}"
-                raise AssertionError("\n".join([problem, str(start), source_text(simulators[0].ruleset)]))
+                raise AssertionError("\n".join([problem, text_of(start), source_text(simulators[0].ruleset)]))
         if step < steps:
             worlds = [sim.step(world, **options) for sim, world in zip(simulators, worlds, strict=True)]
+
+
+def text_of(start: Start) -> str:
+    parts = {"ids": start.ids, **start.fields, "seed": start.seed, "index": start.index, "step": start.step}
+    shown = (
+        f"{name} {values.tolist() if values.size <= 160 else '…'}"
+        for name, values in {**parts, **start.params}.items()
+    )
+    return "\n".join([f"worlds {'×'.join(map(str, start.ids.shape))}", *shown])
 
 
 def source_text(ruleset: Ruleset) -> str:

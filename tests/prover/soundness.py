@@ -34,7 +34,7 @@ from powderdsl.prover.solver import OutOfWork
 from powderdsl.prover.symbolic import Budget, Undecided, deep_recursion
 from powderdsl.prover.verdicts import judgments
 from powderdsl.system.settings import fingerprint
-from powderdsl.testing.generators.cases import Choices, Start
+from powderdsl.testing.generators.cases import Choices, Start, full_state
 from powderdsl.testing.mutation.judging import Original
 from powderdsl.testing.mutation.operators import Mutant
 from powderdsl.testing.properties.breaks import breaks
@@ -43,7 +43,6 @@ from powderdsl.testing.properties.running import (
     Runs,
     context,
     first_difference,
-    full_state,
     random_samples,
 )
 from tests.fuzz.rulemaker import random_ruleset, random_ruleset_text

@@ -138,16 +138,13 @@ class Start:
         fields = {name: kept(values) if name in names else values for name, values in self.fields.items()}
         return replace(self, ids=kept(self.ids), fields=fields)
 
-    def world(self, simulator: Simulator) -> World:
-        """The same worlds for any simulator of the ruleset."""
-        world = simulator.world(self.ids, self.seed, index=self.index)
-        world = replace(world, start=simulator.kind.from_numpy(self.step.copy()))
-        return simulator.replace(world, **self.fields) if self.fields else world
-
-    def __str__(self) -> str:
-        parts = {"ids": self.ids, **self.fields, "seed": self.seed, "index": self.index, "step": self.step, **self.params}  # fmt: skip
-        shown = (f"{name} {values.tolist() if values.size <= 160 else '…'}" for name, values in parts.items())
-        return "\n".join([f"worlds {'×'.join(map(str, self.ids.shape))}", *shown])
+    def world(self, simulator: Simulator, ruleset: Ruleset | None = None) -> World:
+        """The same worlds for any simulator of the ruleset. `ruleset`: whose slots are set, if the simulator has more."""
+        world, put = simulator.world(self.ids, self.seed, index=self.index), simulator.kind.from_numpy
+        dtypes = {slot.name: slot.dtype for slot in simulator.slots}
+        values = full_state(ruleset or simulator.ruleset, self).items()
+        arrays = {name: put(cells.astype(dtypes[name])) for name, cells in values}
+        return replace(world, state={**world.state, **arrays}, start=put(self.step.copy()))
 
 
 def fresh(ruleset: Ruleset, slot: Slot, ids: Array) -> Array:
@@ -169,6 +166,16 @@ def clamped_to_holders(ruleset: Ruleset, slot: Slot, values: Array, ids: Array) 
         return values
     kept = np.where(may[:, None] if slot.planes == 2 else may, values, fresh(ruleset, slot, ids))
     return kept.astype(slot.dtype)
+
+
+def full_state(ruleset: Ruleset, sample: Start) -> dict[str, Array]:
+    """All slots of the start worlds in their storage dtypes. Cells that cannot hold a value have their usual one."""
+    state = {"element": sample.ids}
+    for slot in slots(ruleset)[1:]:
+        values = sample.fields.get(slot.name)
+        values = fresh(ruleset, slot, sample.ids) if values is None else values
+        state[slot.name] = clamped_to_holders(ruleset, slot, values, sample.ids)
+    return state
 
 
 def random_start(

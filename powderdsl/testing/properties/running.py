@@ -17,7 +17,7 @@ from powderdsl.model.state import Slot, slots
 from powderdsl.model.types import FLAG, Assign, Field, Pass, Rule, Ruleset, Substep, substeps
 from powderdsl.simulation.programs import starting_backend
 from powderdsl.simulation.simulator import compile
-from powderdsl.testing.generators.cases import Array, Choices, Start, clamped_to_holders, fresh, random_start
+from powderdsl.testing.generators.cases import Array, Choices, Start, fresh, full_state, random_start
 
 if TYPE_CHECKING:
     from powderdsl.simulation.simulator import Simulator, World
@@ -75,16 +75,12 @@ def run_sample(
 
     `ruleset`: whose slots are kept, if the simulator has more.
     """
-    start = full_state(ruleset or sim.ruleset, sample)
-    world = sim.world(sample.ids, sample.seed, index=sample.index)
-    dtypes = {slot.name: slot.dtype for slot in sim.slots}
-    arrays = {name: sim.kind.from_numpy(values.astype(dtypes[name])) for name, values in start.items()}
-    clock = sim.kind.from_numpy(sample.step.copy())
-    world = replace(world, state={**world.state, **arrays}, start=clock)
-    history = [start]
-    for _ in range(steps):
-        world = sim.step(world, random=random, params=dict(sample.params) or None)
-        history.append({name: sim.kind.to_numpy(world.state[name]) for name in start})
+    names = [slot.name for slot in slots(ruleset or sim.ruleset)]
+    world, history = sample.world(sim, ruleset), list[State]()
+    for step in range(steps + 1):
+        if step:
+            world = sim.step(world, random=random, params=dict(sample.params) or None)
+        history.append({name: sim.kind.to_numpy(world.state[name]) for name in names})
     return history, world
 
 
@@ -209,16 +205,6 @@ def join_starts(samples: Sequence[Start], ruleset: Ruleset) -> Start:
             for name in sorted(params)
         },
     )
-
-
-def full_state(ruleset: Ruleset, sample: Start) -> State:
-    """All slots of the start worlds in their storage dtypes. Cells that cannot hold a value have their usual one."""
-    state: State = {"element": sample.ids}
-    for slot in slots(ruleset)[1:]:
-        values = sample.fields.get(slot.name)
-        values = fresh(ruleset, slot, sample.ids) if values is None else values
-        state[slot.name] = clamped_to_holders(ruleset, slot, values, sample.ids)
-    return state
 
 
 def random_samples(ruleset: Ruleset, seed: int, count: int) -> Iterator[Start]:
