@@ -53,50 +53,31 @@ class Score:
     def cells(self) -> int:
         return int(self.confusion.sum())
 
-    def plain(self) -> dict[str, float | int | None]:
-        """The numbers of `MEASURES` by name, for JSON."""
-        return {name: getattr(self, name) for name in MEASURES}
-
     @property
     def loss(self) -> float:
         """Cross-entropy per cell, in nats."""
         return self.loss_sum / max(self.cells, 1)
 
-    @property
-    def accuracy(self) -> float:
-        return int(self.confusion.diagonal().sum()) / max(self.cells, 1)
-
-    @property
-    def changed_accuracy(self) -> float | None:
-        """The recall of changes: the share of changed cells whose new element is predicted. None without any."""
-        return _share(self.changed_right, self.changed)
-
-    @property
-    def change_precision(self) -> float | None:
-        """The precision of changes: of cells predicted to change, the share predicted right. None without any."""
-        return _share(self.changed_right, self.predicted_changed)
-
-    @property
-    def change_f1(self) -> float | None:
-        """The harmonic mean of precision and recall of changes. None without any actual or predicted changes."""
-        return _share(2 * self.changed_right, self.changed + self.predicted_changed)
-
-    @property
-    def ece(self) -> float | None:
-        """Expected calibration error of the most likely element: probability against accuracy, over all cells."""
-        return self._calibration_error("all")
-
-    @property
-    def changed_ece(self) -> float | None:
-        """The same over the changed cells only."""
-        return self._calibration_error("changed")
-
-    @property
-    def change_ece(self) -> float | None:
-        """Expected calibration error of the probability that a cell changes, over all cells."""
-        return self._calibration_error("change")
+    def plain(self) -> dict[str, float | int | None]:
+        """The measures by name, for JSON; None for shares of no cells."""
+        right, changed, predicted = self.changed_right, self.changed, self.predicted_changed
+        return {
+            "loss": self.loss,
+            "accuracy": int(self.confusion.diagonal().sum()) / max(self.cells, 1),
+            # Recall, precision and their harmonic mean. A change is right if its new element is.
+            "changed_accuracy": _share(right, changed),
+            "change_precision": _share(right, predicted),
+            "change_f1": _share(2 * right, changed + predicted),
+            "ece": self._calibration_error("all"),
+            "changed_ece": self._calibration_error("changed"),
+            "change_ece": self._calibration_error("change"),
+            "cells": self.cells,
+            "changed": changed,
+            "predicted_changed": predicted,
+        }
 
     def _calibration_error(self, kind: str) -> float | None:
+        """The expected calibration error of one of `KINDS`."""
         table = self.bins[KINDS.index(kind)]
         gaps = (table[:, 1] * UNITS - table[:, 2]).abs().sum()
         return _share(int(gaps), UNITS * int(table[:, 0].sum()))
@@ -120,22 +101,6 @@ class Score:
 
     def __add__(self, other: Score) -> Score:
         return Score(*(getattr(self, field.name) + getattr(other, field.name) for field in fields(self)))
-
-
-MEASURES = (
-    "loss",
-    "accuracy",
-    "changed_accuracy",
-    "change_precision",
-    "change_f1",
-    "ece",
-    "changed_ece",
-    "change_ece",
-    "cells",
-    "changed",
-    "predicted_changed",
-)
-"""The numbers of a `Score` by name."""
 
 
 def ids_of(inputs: Tensor) -> Tensor:

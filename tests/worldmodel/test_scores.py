@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from powderdsl.worldmodel.networks import UNet, fresh_unet
-from powderdsl.worldmodel.scores import elements_of, frequent, outcomes, score, still
+from powderdsl.worldmodel.scores import Score, elements_of, frequent, outcomes, score, still
 
 START = torch.tensor([[[0, 0, 1, 1], [2, 2, 2, 0]]], dtype=torch.uint8)
 END = torch.tensor([[[0, 1, 1, 1], [2, 0, 2, 0]]], dtype=torch.uint8)
@@ -19,17 +19,21 @@ END = torch.tensor([[[0, 1, 1, 1], [2, 0, 2, 0]]], dtype=torch.uint8)
 PAIRS = [(START, END)]
 
 
+def values(found: Score, *names: str) -> tuple[float | None, ...]:
+    return tuple(found.plain()[name] for name in names)
+
+
 def test_baselines_are_what_a_hand_computes() -> None:
     found = outcomes(PAIRS, 4)
     assert found.tolist() == [[2, 1, 0, 0], [0, 2, 0, 0], [1, 0, 2, 0], [0, 0, 0, 0]]
     # Six of eight cells stay; one of either kind is counted besides: 7/10. Two other elements share the rest.
     nothing = score(still(found, ids=(0, 1, 2)), PAIRS, 4)
     assert nothing.loss == pytest.approx(-(6 * math.log(0.7) + 2 * math.log(0.15)) / 8)
-    assert (nothing.accuracy, nothing.changed_accuracy, nothing.changed) == (0.75, 0.0, 2)
+    assert values(nothing, "accuracy", "changed_accuracy", "changed") == (0.75, 0.0, 2)
     # Of 0: 2 stay, 1 becomes 1, of 3; one more for each of three elements: 3/6 and 2/6. Of 1: 3/5. Of 2: 3/6 and 2/6.
     usual = score(frequent(found, ids=(0, 1, 2)), PAIRS, 4)
     assert usual.loss == pytest.approx(-(4 * math.log(3 / 6) + 2 * math.log(2 / 6) + 2 * math.log(3 / 5)) / 8)
-    assert (usual.accuracy, usual.changed_accuracy) == (0.75, 0.0)
+    assert values(usual, "accuracy", "changed_accuracy") == (0.75, 0.0)
 
 
 def test_a_network_is_scored_as_torch_would() -> None:
@@ -41,8 +45,8 @@ def test_a_network_is_scored_as_torch_would() -> None:
         logits = network(starts)
     assert found.loss == pytest.approx(float(F.cross_entropy(logits, ends.long())), rel=1e-5)
     right = logits.argmax(1) == ends
-    assert found.accuracy == pytest.approx(float(right.double().mean()))
-    assert found.changed_accuracy == pytest.approx(float(right[starts != ends].double().mean()))
+    expected = float(right.double().mean()), float(right[starts != ends].double().mean())
+    assert values(found, "accuracy", "changed_accuracy") == pytest.approx(expected)
     assert found.cells == 300 * 63
 
 
@@ -100,11 +104,11 @@ def test_changes_have_recall_precision_and_f1() -> None:
     predicted = torch.tensor([[[0, 1, 0, 1], [2, 1, 2, 0]]])
     found = score(lambda ids: F.one_hot(predicted, 3).permute(0, 3, 1, 2).float(), PAIRS, 3)
     assert (found.changed, found.predicted_changed, found.changed_right) == (2, 3, 1)
-    assert (found.changed_accuracy, found.change_precision) == (1 / 2, 1 / 3)
-    assert found.change_f1 == pytest.approx(2 / (2 / 1 + 3 / 1))
+    assert values(found, "changed_accuracy", "change_precision") == (1 / 2, 1 / 3)
+    assert found.plain()["change_f1"] == pytest.approx(2 / (2 / 1 + 3 / 1))
     nothing = score(lambda ids: F.one_hot(ids.long(), 3).permute(0, 3, 1, 2).float(), [(START, START)], 3)
-    assert (nothing.changed_accuracy, nothing.change_precision, nothing.change_f1) == (None, None, None)
-    assert (nothing.changed_ece, nothing.change_ece) == (None, pytest.approx(1 - math.e / (math.e + 2)))
+    assert values(nothing, "changed_accuracy", "change_precision", "change_f1") == (None, None, None)
+    assert values(nothing, "changed_ece", "change_ece") == (None, pytest.approx(1 - math.e / (math.e + 2)))
 
 
 def test_calibration_is_what_a_hand_computes() -> None:
@@ -116,10 +120,11 @@ def test_calibration_is_what_a_hand_computes() -> None:
     chances.scatter_(2, START[0].long()[..., None], stay[..., None])
     logits = chances.double().log().permute(2, 0, 1)[None]
     found = score(lambda ids: logits, PAIRS, 3)
-    assert found.ece == pytest.approx((abs(0.9 - 3 / 4) * 4 + abs(0.75 - 3 / 4) * 4) / 8, abs=1e-6)
+    assert found.plain()["ece"] == pytest.approx((abs(0.9 - 3 / 4) * 4 + abs(0.75 - 3 / 4) * 4) / 8, abs=1e-6)
     # Of the two that change none is right, and the probability of a change is one minus that to stay.
-    assert found.changed_ece == pytest.approx((0.9 + 0.75) / 2, abs=1e-6)
-    assert found.change_ece == pytest.approx((abs(0.1 - 1 / 4) * 4 + abs(0.25 - 1 / 4) * 4) / 8, abs=1e-6)
+    assert found.plain()["changed_ece"] == pytest.approx((0.9 + 0.75) / 2, abs=1e-6)
+    expected = (abs(0.1 - 1 / 4) * 4 + abs(0.25 - 1 / 4) * 4) / 8
+    assert found.plain()["change_ece"] == pytest.approx(expected, abs=1e-6)
     table = found.reliability()
     assert [(round(one["low"] * 15), one["cells"], one["observed"]) for one in table["all"]] == [
         (11, 4, 0.75),
