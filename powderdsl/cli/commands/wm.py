@@ -14,11 +14,10 @@ from powderdsl.cli import options as opt
 from powderdsl.cli.exits import BadInput, user_values
 from powderdsl.cli.output import print_json, progress
 from powderdsl.system.reports import table
-from powderdsl.worldmodel.config import PRESETS, DataConfig, TrainConfig
+from powderdsl.worldmodel.config import PRESETS, DataConfig, Machine, TrainConfig
 
 if TYPE_CHECKING:
     from powderdsl.model.types import Ruleset
-    from powderdsl.worldmodel.config import Machine
     from powderdsl.worldmodel.evaluation import Strip, Tested
     from powderdsl.worldmodel.networks import CustomNetwork
     from powderdsl.worldmodel.training import Trained, TrainingProgress
@@ -28,7 +27,6 @@ if TYPE_CHECKING:
 OF_WORLDS = {field.name for field in fields(DataConfig)} - {"task"}
 OF_WORLDS |= {"packs", "held_out", "settings", "worlds", "after"}
 """Options that select worlds: a dataset has its own."""
-MACHINE = ("device", "threads", "backend", "store")
 
 _recording = opt.path("--data", "DATASET", "Transitions with actions, recorded by `powderdsl record`.")
 _machine_options = opt.several(
@@ -248,16 +246,15 @@ def tested_on(values: Mapping[str, Any]) -> dict[str, Any]:
     return opt.given_options(values, ("task", "split", "rules", "only", "knobs"))
 
 
-def _machine(values: dict[str, Any]) -> Machine:
-    """Take the device and storage out of the options of a command."""
+def _machine(values: Mapping[str, Any]) -> Machine:
+    """The device and storage in the options of a command."""
     import torch
 
     from powderdsl.simulation.programs import find_device
-    from powderdsl.worldmodel.config import Machine
 
     find_device(values["device"])
     torch.set_num_threads(values["threads"])
-    return Machine(**{name: values.pop(name) for name in MACHINE if name in values})
+    return Machine(**opt.given_settings(values, Machine))
 
 
 def _refuse_world_options(values: Mapping[str, Any]) -> None:
