@@ -35,12 +35,6 @@ DATA = "data"
 """Minari's subfolder of a dataset's folder."""
 
 
-def require_minari() -> None:
-    """Raise CompileError (PD612) if Minari or h5py is not installed."""
-    for module in ("h5py", "minari"):
-        require(module, "reading and writing Minari datasets", "pip install 'powderdsl[minari]'")
-
-
 # Export
 
 
@@ -64,14 +58,13 @@ def to_minari(
             PD630 if a shard is damaged.
         ValueError: Minari rejects the id.
     """
-    require_minari()
+    place = _place(dataset_id)
     import minari
     from gymnasium.spaces import Box, MultiDiscrete
     from minari.dataset.minari_dataset import parse_dataset_id
     from minari.dataset.minari_storage import MinariStorage
     from minari.namespace import create_namespace, list_local_namespaces
 
-    place = _place(dataset_id)
     namespace, *_ = parse_dataset_id(dataset_id)
     if place.exists():
         raise failure(
@@ -174,7 +167,6 @@ def from_minari(dataset_id: str, folder: str | Path) -> Dataset:
             written by `to_minari`; PD631 if the folder has another dataset; PD613 if the folder cannot be written.
         ValueError: Minari rejects the id.
     """
-    require_minari()
     source = _opened(_place(dataset_id) / DATA)
     recipe, place = _exported_recipe(source), Path(folder)
     with lock_place(place):
@@ -243,7 +235,9 @@ def _episode(source: minari.MinariDataset, number: int, recipe: Recipe) -> dict[
 
 
 def _place(dataset_id: str) -> Path:
-    """The folder of a Minari dataset. Raises ValueError if Minari rejects the id."""
+    """The folder of a Minari dataset. Raises CompileError (PD612) without Minari, ValueError if it rejects the id."""
+    for module in ("h5py", "minari"):
+        require(module, "reading and writing Minari datasets", "pip install 'powderdsl[minari]'")
     from minari.dataset.minari_dataset import parse_dataset_id
     from minari.storage import get_dataset_path
 
