@@ -154,12 +154,16 @@ def _check(name: str, prove: int | None, cost: bool, ledger: bool) -> Checked:
         title, key = f"invariants of {ruleset.name}", f"{prove} {ruleset.text_key}"
         broken, claims = persistent(title, key, lambda: _judged(ruleset, prove))
         diagnostics = (*diagnostics, *broken)
-    expenses = None
+    expenses = balance = None
     if cost:
         from powderdsl.analysis.costs import costs
 
         expenses = costs(lower(ruleset))
-    return Checked(name, diagnostics, ruleset, expenses, _ledger(ruleset) if ledger else None, claims)
+    if ledger:
+        from powderdsl.analysis.ledger import ledger as ledger_of
+
+        balance = ledger_of(ruleset)
+    return Checked(name, diagnostics, ruleset, expenses, balance, claims)
 
 
 def _corrected(result: Checked, check: Callable[[], Checked], quiet: bool) -> Checked | None:
@@ -195,12 +199,6 @@ def _judged(ruleset: Ruleset, prove: int) -> tuple[tuple[Diagnostic, ...], tuple
     results = quick_results(ruleset, prove)
     claims = tuple({**result_data(result), "line": result_line(result)} for result in results)
     return refuted(ruleset, results), claims
-
-
-def _ledger(ruleset: Ruleset) -> Ledger:
-    from powderdsl.analysis.ledger import ledger
-
-    return ledger(ruleset)
 
 
 def _cost_lines(passes: tuple[PassCost, ...]) -> Iterator[str]:
