@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from shutil import rmtree
@@ -168,23 +168,19 @@ def add_shard(
 # Playing
 
 
+@dataclass
 class _Recording:
     """Plays the episodes of all missing shards in order, and writes each shard when its last episode ends."""
 
-    def __init__(
-        self,
-        program: TaskProgram,
-        policy: Policy | ExpertPlayer,
-        sight: Observation,
-        folder: Path,
-        manifest: Manifest,
-    ):
-        self.recipe, self.manifest, self.folder = manifest.recipe, manifest, folder
-        self.program, self.policy, self.sight = program, policy, sight
+    program: TaskProgram
+    policy: Policy | ExpertPlayer
+    sight: Observation
+    folder: Path
+    manifest: Manifest
 
     def play(self, envs: int, progress: Progress) -> None:
         """Play at most `envs` episodes at once until all shards are written."""
-        recipe, recorded = self.recipe, {row.number for row in self.manifest.shards}
+        recipe, recorded = self.manifest.recipe, {row.number for row in self.manifest.shards}
         shards = [number for number in range(recipe.shards) if number not in recorded]
         numbers = np.array([episode for number in shards for episode in recipe.episodes_of(number)], np.int64)
         batch = max(1, min(envs, PLAYING_BYTES // episode_bytes(recipe)))
@@ -201,7 +197,7 @@ class _Recording:
 
     def played(self, numbers: Array, done: int, progress: Progress) -> list[dict[str, Array]]:
         """The arrays of some episodes, played at once. Finished episodes continue to run, but are ignored."""
-        recipe, count = self.recipe, len(numbers)
+        recipe, count = self.manifest.recipe, len(numbers)
         env = environment(
             self.program,
             count,
