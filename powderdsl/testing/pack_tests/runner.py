@@ -101,11 +101,10 @@ def start_of(example: Example, sim: Simulator, *seeds: int) -> World:
     ids = _ids(example, sim.ruleset)
     grid = np.array([[ids[char] for char in row] for row in example.given], dtype=np.uint8)
     world = sim.world(np.stack([grid] * len(seeds)), seed=list(seeds))
-    table = {slot.name: slot for slot in sim.slots}
     fields = {}
     for drawn in example.fields:
         values = sim.kind.to_numpy(world.state[drawn.name]).copy()
-        may_hold = holding(sim.ruleset, table[drawn.name], grid)
+        may_hold = holding(sim.ruleset, sim.slot_by_name[drawn.name], grid)
         for row, cells in enumerate(drawn.cells):
             for column, cell in enumerate(cells):
                 if cell and (may_hold[row, column] or not drawn.everywhere):
@@ -182,7 +181,7 @@ def _rows(world: NDArray[np.uint8], example: Example, ruleset: Ruleset) -> tuple
 
 def field_problem(grid: FieldGrid, world: World) -> tuple[int, str] | None:
     """The first of some worlds that is not as the grid says: its number, and `row 1, column 2 is 3, not 4`."""
-    slot = next(slot for slot in world.sim.slots if slot.name == grid.name)
+    slot = world.sim.slot_by_name[grid.name]
     to_numpy = world.sim.kind.to_numpy
     values, fresh = (to_numpy(start.state[grid.name]) for start in (world, world.sim.world(world.ids)))
     low, high = fresh.copy(), fresh.copy()
@@ -212,9 +211,8 @@ def field_problem(grid: FieldGrid, world: World) -> tuple[int, str] | None:
 
 def field_rows(name: str, world: World, index: int) -> tuple[str, ...]:
     """A field of one world as tests draw it: rows of words, in columns. Floats with all their digits."""
-    kind = next(slot.kind for slot in world.sim.slots if slot.name == name)
     values = world.sim.kind.to_numpy(world.state[name])[index]
-    words = field_words(world.sim.ruleset, kind, values)
+    words = field_words(world.sim.ruleset, world.sim.slot_by_name[name].kind, values)
     wide = [max(len(row[column]) for row in words) for column in range(len(words[0]))]
     return tuple(" ".join(word.rjust(size) for word, size in zip(row, wide, strict=True)) for row in words)
 

@@ -225,21 +225,15 @@ def random_samples(ruleset: Ruleset, seed: int, count: int) -> Iterator[Start]:
             if group % 2:
                 sample = replace(sample, fields={}, params={})
             if group % 4 == 1 and frames and min(shape) > 2:
-                sample = replace(sample, ids=frame_worlds(sample.ids, choices.pick(frames)))
+                ids, frame = sample.ids.copy(), choices.pick(frames)
+                ids[:, [0, -1], :] = ids[:, :, [0, -1]] = frame
+                sample = replace(sample, ids=ids)
             groups.append(sample)
         yield join_starts(groups, ruleset)
         left -= batch
         number += 1
     choices = Choices.seeded(seed)
     yield random_start(ruleset, choices, (4, *LARGE)).seeded()
-
-
-def frame_worlds(ids: Array, number: int) -> Array:
-    """Worlds with one element in all cells at their edges."""
-    ids = ids.copy()
-    ids[:, [0, -1], :] = number
-    ids[:, :, [0, -1]] = number
-    return ids
 
 
 # Worlds seen in a mirror or turned by a quarter: directions and vectors turn with their cells
