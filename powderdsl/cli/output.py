@@ -7,6 +7,7 @@ import sys
 import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
+from dataclasses import fields, is_dataclass
 from pathlib import Path
 from shlex import quote
 from typing import IO, TYPE_CHECKING, Any
@@ -14,7 +15,6 @@ from typing import IO, TYPE_CHECKING, Any
 import click
 
 from powderdsl.diagnostics.printable import printable, printable_streams, raw_stream, write_styled
-from powderdsl.system.reports import as_json
 
 if TYPE_CHECKING:
     from powderdsl.diagnostics import Diagnostic
@@ -37,8 +37,19 @@ def write_diagnostics(diagnostics: Iterable[Diagnostic], stream: IO[str]) -> Non
 
 
 def print_json(value: Any) -> None:
-    """Print a value as indented JSON; dataclasses are objects (`system.reports.as_json`)."""
-    click.echo(as_json(value))
+    """Print a value as indented JSON. A dataclass becomes an object with a key for each field, without the final `_` of
+    a field such as `from_`."""
+    import json
+
+    click.echo(json.dumps(value, indent=2, ensure_ascii=False, default=_json_value))
+
+
+def _json_value(value: Any) -> Any:
+    if is_dataclass(value):
+        return {field.name.rstrip("_"): getattr(value, field.name) for field in fields(value)}
+    if isinstance(value, frozenset):
+        return sorted(value)
+    return str(value)
 
 
 def counted(number: int, thing: str, things: str = "") -> str:

@@ -473,7 +473,7 @@ def this_machine(device: str) -> dict[str, Any]:
 
 
 def report_data(report: Report) -> dict[str, Any]:
-    """A report for `as_json`: every figure, and the seconds of every round."""
+    """A report for JSON: every figure, and the seconds of every round."""
     plan = report.plan
     cells = []
     for figures in report.cells:

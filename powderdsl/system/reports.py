@@ -1,11 +1,9 @@
-"""Output of commands and studies: aligned tables, and JSON of dataclasses."""
+"""Output of commands and studies: aligned tables."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Sequence
-from dataclasses import fields, is_dataclass
-from typing import Any
 
 from powderdsl.diagnostics.printable import printable
 
@@ -37,19 +35,3 @@ def table(rows: Sequence[Sequence[str]], indent: str = "  ") -> Iterator[str]:
 
 def _width(cell: str) -> int:
     return len(_STYLE.sub("", cell))
-
-
-def as_json(value: Any) -> str:
-    """Indented JSON. A dataclass becomes an object with a key for each field, without the final `_` of a field such as
-    `from_`."""
-    import json
-
-    return json.dumps(value, indent=2, ensure_ascii=False, default=_json_value)
-
-
-def _json_value(value: Any) -> Any:
-    if is_dataclass(value):
-        return {field.name.rstrip("_"): getattr(value, field.name) for field in fields(value)}
-    if isinstance(value, frozenset):
-        return sorted(value)
-    return str(value)

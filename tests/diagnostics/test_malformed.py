@@ -6,6 +6,7 @@ the text under the caret (its first line; None where it does not matter, or ther
 
 from __future__ import annotations
 
+import json
 import os
 from pathlib import Path
 from time import process_time
@@ -15,7 +16,6 @@ import pytest
 import powderdsl
 from powderdsl.diagnostics import Diagnostic
 from powderdsl.diagnostics.diagnostic import diagnostic_data, render_text
-from powderdsl.system.reports import as_json
 from tests.diagnostics.malformed_details import DETAILS
 from tests.refusals import refusal
 
@@ -286,7 +286,7 @@ def check(text: str | bytes, code: str, caret: str | None, path: Path) -> None:
         assert len(render_text(one)) < 3000
         assert one.message[:1] == one.message[:1].lower() or one.message.startswith("`")
         assert not one.message.endswith(".")
-    assert as_json([diagnostic_data(one, utf16=True) for one in (first, *others)])
+    assert json.dumps([diagnostic_data(one, utf16=True) for one in (first, *others)])
 
 
 def rows(table: list) -> list:  # type: ignore[type-arg]

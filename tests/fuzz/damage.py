@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import resource
 import sys
@@ -20,7 +21,6 @@ from powderdsl.model.check import check
 from powderdsl.model.declarations import PackDecl, RulesetDecl, read_file
 from powderdsl.model.types import Ruleset
 from powderdsl.syntax.sources import shipped
-from powderdsl.system.reports import as_json
 from powderdsl.system.writing import replacing
 from powderdsl.testing.generators.cases import Choices
 from tests.fuzz.crew import Lost, work_through
@@ -98,7 +98,7 @@ def check_printable(diagnostics: tuple[Diagnostic, ...]) -> None:
         span = one.primary.span
         assert span is None or 0 <= span.start < max(span.end, 1) <= max(len(span.source.text), 1) + 1
         assert render_text(one)
-    assert as_json([diagnostic_data(one, utf16=True) for one in diagnostics])
+    assert json.dumps([diagnostic_data(one, utf16=True) for one in diagnostics])
 
 
 # Kinds of damage

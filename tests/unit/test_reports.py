@@ -6,7 +6,8 @@ import json
 from dataclasses import dataclass
 from pathlib import Path
 
-from powderdsl.system.reports import Painted, as_json, table
+from powderdsl.cli.output import print_json
+from powderdsl.system.reports import Painted, table
 
 
 @dataclass(frozen=True)
@@ -31,6 +32,7 @@ def test_only_painted_cells_have_terminal_codes():
     assert list(table(rows)) == ["  color", "  \x1b[1mred\x1b[0m", "  \\u001b[1m"]
 
 
-def test_dataclasses_are_objects():
-    data = json.loads(as_json([Row("ice", frozenset({"b", "a"}), Path("x.yaml"))]))
+def test_dataclasses_are_objects(capsys):
+    print_json([Row("ice", frozenset({"b", "a"}), Path("x.yaml"))])
+    data = json.loads(capsys.readouterr().out)
     assert data == [{"from": "ice", "seen": ["a", "b"], "file": "x.yaml"}]
