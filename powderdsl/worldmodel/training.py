@@ -176,18 +176,8 @@ VALIDATED = 256
 MEASURED = ("accuracy", "changed_accuracy", "change_f1", "ece", "change_ece")
 """Measures of a validation besides the loss."""
 
-Tell = Callable[["TrainingProgress"], None]
-
-
-@dataclass(frozen=True)
-class TrainingProgress:
-    """The state after each iteration: the number of iterations, and the last logged loss."""
-
-    done: int
-    of: int
-    loss: float | None
-    validation: float | None = None
-    """The last loss on held-out worlds."""
+Progress = Callable[[int, float | None, float | None], None]
+"""Called after each iteration with their number so far, the last logged loss, and the last loss on held-out worlds."""
 
 
 def train(
@@ -200,7 +190,7 @@ def train(
     network: nn.Module | CustomNetwork | None = None,
     parent: Checkpoint | None = None,
     note: Mapping[str, Any] | None = None,
-    tell: Tell = lambda progress: None,
+    tell: Progress = lambda *_: None,
     save_seconds: float = 60,
     validate_every: int = 0,
 ) -> RunFolder:
@@ -304,7 +294,7 @@ class _Trainer:
             self.optimizer.load_state_dict(checkpoint.state["optimizer"])
             self.done, self.recent = checkpoint.step, [float(loss) for loss in checkpoint.state["recent"]]
 
-    def train(self, tell: Tell, save_seconds: float) -> None:
+    def train(self, tell: Progress, save_seconds: float) -> None:
         """Train to the end. A signal is raised after a checkpoint is written, a second one immediately."""
         config, total = self.config, self.config.iterations
         loss, held_out, making = None, None, 0.0
@@ -341,7 +331,7 @@ class _Trainer:
                     since += time.monotonic() - began
                 if values:
                     metrics.write(self.done, values)
-                tell(TrainingProgress(self.done, total, loss, held_out))
+                tell(self.done, loss, held_out)
                 if time.monotonic() - saved > save_seconds:
                     self.save()
                     saved = time.monotonic()

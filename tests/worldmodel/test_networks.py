@@ -15,7 +15,6 @@ from powderdsl.diagnostics import CompileError
 from powderdsl.experiments.runs import read_metrics
 from powderdsl.worldmodel import TrainConfig, custom_network, load_trained, train
 from powderdsl.worldmodel.networks import ActionChannels, CustomNetwork
-from powderdsl.worldmodel.training import TrainingProgress
 from tests.cli.commands import powderdsl as run
 from tests.refusals import refusal, refused_codes
 from tests.states import logged, same
@@ -125,10 +124,10 @@ def test_a_run_in_parts_is_a_run_at_once(name: str | None, dunes: str) -> None:
     for score in ("accuracy", "changed_accuracy", "change_f1", "ece", "change_ece"):
         assert 0 <= found[30][f"validation/{score}"] <= 1
 
-    def stop(now: TrainingProgress) -> None:
-        if now.done in (7, 14):
+    def stop(done: int, *_: float | None) -> None:
+        if done in (7, 14):
             signal.raise_signal(signal.SIGINT)
-        if now.done == 19:
+        if done == 19:
             raise RuntimeError("stopped")
 
     for error, seconds in ((KeyboardInterrupt, 600), (KeyboardInterrupt, 600), (RuntimeError, 0)):

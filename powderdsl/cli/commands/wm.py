@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from powderdsl.model.types import Ruleset
     from powderdsl.worldmodel.evaluation import Strip, Tested
     from powderdsl.worldmodel.networks import CustomNetwork
-    from powderdsl.worldmodel.training import Trained, TrainingProgress
+    from powderdsl.worldmodel.training import Trained
     from powderdsl.worldmodel.worlds import Recording
 
 
@@ -308,9 +308,9 @@ def _run(config: TrainConfig, folder: Path, values: dict[str, Any], **more: Any)
     began = time.monotonic()
     with progress("wm", config.iterations, lines=True, resumes=folder) as show:
 
-        def tell(now: TrainingProgress) -> None:
-            losses = [("loss", now.loss), ("held out", now.validation)]
-            show(now.done, ", ".join(f"{name} {loss:.4f}" for name, loss in losses if loss is not None))
+        def tell(done: int, loss: float | None, held_out: float | None) -> None:
+            losses = [("loss", loss), ("held out", held_out)]
+            show(done, ", ".join(f"{name} {value:.4f}" for name, value in losses if value is not None))
 
         run = train(
             config,
