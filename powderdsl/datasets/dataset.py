@@ -271,7 +271,7 @@ class Dataset:
     @property
     def steps(self) -> int:
         """The number of transitions."""
-        return self.manifest.transitions
+        return sum(row.transitions for row in self.manifest.shards)
 
     def require(self, env: TensorEnv, *, same_rules: bool = False) -> None:
         """Reject an environment in which these observations and actions have another meaning.

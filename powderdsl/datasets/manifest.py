@@ -109,10 +109,6 @@ class Manifest:
     shards: Annotated[tuple[ShardRow, ...], Limits(length=(0, MAX_SHARDS))]
     """The recorded shards, ascending."""
 
-    @property
-    def transitions(self) -> int:
-        return sum(row.transitions for row in self.shards)
-
 
 def shard_file(number: int) -> str:
     return f"shard-{number:06d}.npz"
