@@ -6,7 +6,6 @@ import time
 from collections.abc import Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass
-from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -114,12 +113,8 @@ def play(start: World, plan: Playback) -> World:
     def stream() -> Iterator[World]:
         """The world each time it is shown."""
         nonlocal world
-        done = 0
-        for step in chain(range(0, plan.steps, stride), [plan.steps]):
-            if step > done:
-                world = world.sim.step(world, steps=step - done)
-            done = step
-            show(step)
+        for number, world in enumerate(start.sim.frames(start, plan.steps, stride)):
+            show(min(number * stride, plan.steps))
             yield world
 
     def picture(world: World) -> Any:
