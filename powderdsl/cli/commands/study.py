@@ -10,7 +10,7 @@ from dataclasses import replace
 from functools import cache, lru_cache, partial
 from importlib import import_module
 from importlib.util import find_spec
-from itertools import islice, product
+from itertools import count, islice, product
 from pathlib import Path
 from string import Template
 from typing import TYPE_CHECKING, Any
@@ -241,13 +241,11 @@ def command(
 
 
 def _with_progress(run: StudyRun, points: list[Point], jobs: int | None, ray: str | None) -> list[Outcome]:
-    done = 0
+    done = count(1)
     with progress(run.study.name, len(points), resumes=run.folder) as show:
 
         def report(outcome: Outcome) -> None:
-            nonlocal done
-            done += 1
-            show(done)
+            show(next(done))
             text = ", ".join(f"{name} {value:.4g}" for name, value in outcome.values.items())
             click.echo(f"{outcome.point.name}: {outcome.problem or text}", err=True)
 

@@ -215,8 +215,7 @@ def random_samples(ruleset: Ruleset, seed: int, count: int) -> Iterator[Start]:
     """
     frames = sorted(unchanging_ids(ruleset))
     batch = 64
-    left, number = count, 0
-    while left > 0:
+    for number, left in enumerate(range(count, 0, -batch)):
         shape = SHAPES[number % len(SHAPES)]
         groups = []
         for group in range(min(batch, left + ALIKE - 1) // ALIKE):
@@ -230,8 +229,6 @@ def random_samples(ruleset: Ruleset, seed: int, count: int) -> Iterator[Start]:
                 sample = replace(sample, ids=ids)
             groups.append(sample)
         yield join_starts(groups, ruleset)
-        left -= batch
-        number += 1
     choices = Choices.seeded(seed)
     yield random_start(ruleset, choices, (4, *LARGE)).seeded()
 
