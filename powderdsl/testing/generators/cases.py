@@ -9,7 +9,7 @@ from random import Random
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from powderdsl.arrays import np
-from powderdsl.model.state import SNAP, Slot, fitting, fresh_values, holders, slots
+from powderdsl.model.state import SNAP, Slot, fitting, fresh_values, holders, slots, stored_range
 from powderdsl.model.types import Kind, Ruleset
 
 if TYPE_CHECKING:
@@ -230,7 +230,7 @@ def _values(ruleset: Ruleset, slot: Slot, ids: np.ndarray, fill: _Fill) -> np.nd
     if slot.is_real:
         values = fill.choose(_reals(kind.lo, kind.hi, choices), slot.planes).astype(np.float32)
     else:
-        lo, hi = {"flag": (0, 1), "direction": (0, 7)}.get(kind.name, (int(kind.lo), int(kind.hi)))
+        lo, hi = map(int, stored_range(kind))
         options = [e.id for e in ruleset.elements] if kind.name == "element" else _integers(lo, hi, choices)
         values = fill.choose(options).astype(slot.dtype)
     return clamped_to_holders(ruleset, slot, values, ids)
