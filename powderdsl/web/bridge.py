@@ -236,7 +236,6 @@ class Session:
 
     def trace(self, world: dict[str, Any], row: int, column: int, params: dict[str, float]) -> dict[str, Any]:
         """The trace of a cell in the next step of a world, as text and as data, with some values of `params` replaced."""
-        from powderdsl.simulation.simulator import Simulator
         from powderdsl.simulation.tracing import trace, trace_data, trace_text
 
         reporter, sim = Reporter(), self._simulator()
@@ -245,7 +244,7 @@ class Session:
         if changed := {name: value for name, value in params.items() if value != defaults.get(name)}:
             rules = set_params(rules, changed, reporter)
             reporter.raise_if_errors()
-            sim = Simulator(rules, "wasm", tensors=False, memo=self.memo)
+            sim = sim.of(rules)
         traced = trace(self._world(world, sim), int(row), int(column), 1)
         return {"text": trace_text(traced), "data": trace_data(traced)}
 
