@@ -12,7 +12,7 @@ import pytest
 
 import powderdsl as library
 from powderdsl.diagnostics import Severity
-from powderdsl.model.text import place_of
+from powderdsl.model.text import one_line, place_of
 from powderdsl.testing.generators.cases import Start
 from powderdsl.testing.pack_tests.runner import run_examples
 from powderdsl.testing.properties.outcomes import Result
@@ -160,7 +160,8 @@ def test_of_two_added_packs_the_one_that_matters_is_named() -> None:
 
 def tried(ruleset: library.Ruleset, cells: list[list[int]]) -> list[Result]:
     """What comes of a world of these elements with many seeds."""
-    search = InvariantSearch.of(Runner(ruleset, "reference"), SearchPlan(0), declared_only=True)
+    texts = [one_line(invariant.span) for invariant in ruleset.invariants]
+    search = InvariantSearch.of(Runner(ruleset, "reference"), SearchPlan(0), texts)
     search.try_sample(replace(Start.fresh(cells).repeated(512), seed=np.arange(512)), 3)
     return search.finish()
 

@@ -77,23 +77,14 @@ class InvariantSearch:
     few: Mapping[type, int] = field(default_factory=lambda: FEW)
 
     @classmethod
-    def of(
-        cls,
-        runner: Runs,
-        plan: SearchPlan,
-        declared_only: bool = False,
-        texts: Collection[str] | None = None,
-    ) -> Self:
-        """Prove what can be proven; the rest is to be tried. `declared_only`: leave out what no pack claims.
-
-        `texts`: the only claims that matter.
-        """
+    def of(cls, runner: Runs, plan: SearchPlan, texts: Collection[str] | None = None) -> Self:
+        """Prove what can be proven; the rest is to be tried. `texts`: the only claims that matter."""
         entries, search = ledger(runner.ruleset), cls(runner, plan)
         for prop in properties_of(runner.ruleset):
             if texts is not None and prop.text not in texts:
                 continue
             if prop.owner == AUTOMATIC:
-                search.trials += [] if declared_only else [Result(prop)]
+                search.trials += [] if isinstance(runner, Oracle) else [Result(prop)]  # it agrees with itself
                 continue
             proof = prove(prop.claim, runner.ruleset, entries, prop.without)  # type: ignore[arg-type]
             if proof is None:
@@ -201,7 +192,7 @@ class InvariantSearch:
                 continue
             some = [(trial, world) for trial, world in broken if trial.prop.scope == scope]
             texts = [trial.prop.text for trial, _ in some]
-            search = self.of(self.runner.of(alone), self.plan, declared_only=True, texts=texts)
+            search = self.of(self.runner.of(alone), self.plan, texts)
             for _, world in some:
                 sample = translated(world.sample, ruleset, alone)
                 if sample is not None:
@@ -299,7 +290,7 @@ def quick_results(ruleset: Ruleset, proof: float = PROOF) -> list[Result]:
 
     The same rules give the same worlds. `proof`: as in SearchPlan.
     """
-    search = InvariantSearch.of(Oracle(ruleset), SearchPlan(QUICK, inf, proof=proof), declared_only=True)
+    search = InvariantSearch.of(Oracle(ruleset), SearchPlan(QUICK, inf, proof=proof))
     search.try_random()
     return search.finish()
 
