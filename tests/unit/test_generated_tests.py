@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 
 from powderdsl.diagnostics import Source
+from powderdsl.prover.symbolic import Renaming
 from powderdsl.simulation.simulator import compile
 from powderdsl.testing.mutation.judging import GeneratedTest, Original, judge, with_tests, written_test
 from powderdsl.testing.pack_tests.runner import run_examples
@@ -79,7 +80,7 @@ def test_fields_are_drawn_where_elements_do_not_tell(tmp_path, old, new, drawn):
     original = Original.of(str(path))
     mutant = original.mutants()[0]
     changed = compile(load_text(FIELDS.replace(old, new)), backend="wasm")
-    found = distinguish(original.sim, changed)
+    found = distinguish(original.sim, changed, (), 0, None, Renaming())
     assert found is not None
     text = written_test(mutant, found, original.sim, original.packs).text
     assert drawn in text

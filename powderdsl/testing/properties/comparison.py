@@ -93,7 +93,7 @@ def compare(
             model, numbers = difference.transition.model, difference.passes[0]
             place = f"pass `{first.ruleset.passes[numbers[0]].name}`" if numbers else "a pass"
             reason = f"{place} may differ"
-    distinction = distinguish(first, second, focus, seed, model, names) if search else None
+    distinction = distinguish(first, second, focus, seed, model, names or Renaming()) if search else None
     status = "undecided" if distinction is None else "differ"
     return Comparison(status, reason, distinction=distinction)
 
@@ -166,20 +166,15 @@ def _uses(ruleset: Ruleset) -> dict[str, tuple[int, str]]:
 
 
 def distinguish(
-    first: Simulator,
-    second: Simulator,
-    focus: Sequence[int] = (),
-    seed: int = 0,
-    model: Model | None = None,
-    names: Renaming | None = None,
+    first: Simulator, second: Simulator, focus: Sequence[int], seed: int, model: Model | None, names: Renaming
 ) -> Distinction | None:
     """A small world on which two simulators differ, or None if none was found.
 
     Worlds of a model are tried first. Half of the others are made of elements `focus`, ids that are likely to matter.
-    Equal seeds give the same worlds. `names`: as for `compare`.
+    Equal seeds give the same worlds. `names` are the first one's names of the other's parameters and streams.
     """
     slots = tuple(slot.name for slot in first.slots if slot.name in {other.name for other in second.slots})
-    sides = (first, Renaming()), (second, names or Renaming())
+    sides = (first, Renaming()), (second, names)
     streams = [replace(s, name=words.stream(s.name)) for sim, words in sides for s in sim.ruleset.streams]
 
     def states(draws: Draws, sample: Start, steps: int) -> Iterator[list[State]]:
