@@ -9,34 +9,9 @@ from functools import cache
 
 from powderdsl.diagnostics import Source, Span
 from powderdsl.model.builtins import COORDINATES, DIRECTION_SETS, DIRECTIONS, KERNELS
-from powderdsl.model.declarations import (
-    Definition,
-    ElementDecl,
-    FieldDecl,
-    KernelDecl,
-    PackDecl,
-    ParamDecl,
-    PassDecl,
-    PropertyDecl,
-    SetDecl,
-    StreamDecl,
-    TagDecl,
-)
+from powderdsl.model.declarations import PackDecl
 from powderdsl.model.operations import FUNCTIONS
 from powderdsl.syntax.parse import reserved_words
-
-KINDS: dict[type[Definition], str] = {
-    ElementDecl: "element",
-    TagDecl: "tag",
-    PropertyDecl: "property",
-    FieldDecl: "field",
-    ParamDecl: "parameter",
-    SetDecl: "set",
-    KernelDecl: "kernel",
-    StreamDecl: "stream",
-    PassDecl: "pass",
-}
-"""Names of the kinds of definitions."""
 
 TEXT = re.compile(r'(^|\s)#.*$|\babout:\s*("[^"]*"|[^,}\n]*)', re.MULTILINE)
 """Comments and sentences, which contain no names."""
@@ -63,7 +38,8 @@ def definitions(packs: Sequence[PackDecl]) -> Iterator[Word]:
         for section in sections:
             for entry in section:
                 about = getattr(entry, "about", "")
-                yield Word(entry.name.text, KINDS[type(entry)], about, entry.name.span, pack.name.text)
+                kind = entry.NOUN.partition(" ")[2]
+                yield Word(entry.name.text, kind, about, entry.name.span, pack.name.text)
 
 
 @cache
