@@ -14,7 +14,7 @@ from powderdsl.ir.text import structure
 from powderdsl.model.state import Slot, fresh_values, slots
 from powderdsl.model.types import Ruleset
 from powderdsl.prover.induction import HERE, MAX_WHOLE, Transition, growing_ranges
-from powderdsl.prover.net import Literal
+from powderdsl.prover.net import FALSE, Literal
 from powderdsl.prover.solver import OutOfWork
 from powderdsl.prover.symbolic import (
     MAX_SIZE,
@@ -24,9 +24,9 @@ from powderdsl.prover.symbolic import (
     Layout,
     Renaming,
     Symbols,
-    Term,
     Undecided,
     World,
+    Written,
     layouts,
 )
 
@@ -53,26 +53,15 @@ class Side:
         return cls(ruleset, lower(ruleset), names or Renaming())
 
 
-class Shared:
+def _shared_world(before: Before, own: Mapping[str, Layout], shared: Mapping[str, Layout]) -> World:
     """A world of variables, with the ranges that both sides share, as one side reads it."""
-
-    def __init__(self, before: Before, own: Mapping[str, Layout], shared: Mapping[str, Layout]) -> None:
-        self.before = before
-        self._missing: dict[str, str | None] = {}
-        """Planes that only this side has: the plane of the sign, if there is one."""
-        for name, row in own.items():
-            common = shared[name]
-            for plane in row.planes[len(common.planes) :]:
-                self._missing[plane] = common.planes[-1] if common.signed else None
-
-    def bit(self, plane: str, y: int, x: int) -> Literal:
-        if plane not in self._missing:
-            return self.before.bit(plane, y, x)
-        sign = self._missing[plane]
-        return self.before.bit(sign, y, x) if sign else 0
-
-    def real(self, slot: str, y: int, x: int) -> Term:
-        return self.before.real(slot, y, x)
+    signs = {
+        plane: shared[name].planes[-1] if shared[name].signed else ""
+        for name, row in own.items()
+        for plane in row.planes[len(shared[name].planes) :]
+    }
+    """By plane that only this side has: the plane of the sign, if there is one."""
+    return Written(before, signs, lambda sign, y, x: before.bit(sign, y, x) if sign else FALSE)
 
 
 def why_incomparable(first: Ruleset, second: Ruleset) -> str | None:
@@ -165,7 +154,7 @@ def _differ(
     afters: list[World] = []
     planes: dict[str, bool] = {}
     for side, slots_, passes in zip(sides, own, numbers, strict=True):
-        world: World = Shared(before, slots_, shared)
+        world = _shared_world(before, slots_, shared)
         params = {p.name: p.default for p in side.ruleset.params} if fixed else None
         for number in passes:
             outputs = lower_pass(side.program, side.program.passes[number]).outputs

@@ -24,11 +24,11 @@ from powderdsl.prover.symbolic import (
     Formulas,
     Ranges,
     Renaming,
-    Reset,
     Symbols,
     Turned,
     Undecided,
     World,
+    reset,
 )
 
 HERE: Cell = (0, 0)
@@ -147,7 +147,7 @@ class Prover:
     def start(self) -> Transition:
         """The start of a step, where slots are reset."""
         before = Before(symbols := self._symbols())
-        return Transition("start", symbols, (before,), before, Reset(before, symbols))
+        return Transition("start", symbols, (before,), before, reset(before, symbols))
 
     def broken_by(self, check: Check, *, everywhere: bool = False) -> Transition | None:
         """The first transition of a step that fails a check. Unless the check must hold `everywhere`, it may hold for a
@@ -296,7 +296,7 @@ class Prover:
             names = Renaming(
                 streams={s.name: f"{s.name} {step}" for s in self.ruleset.streams}
             )  # each step draws new numbers
-            world = Reset(world, symbols)
+            world = reset(world, symbols)
             for pass_ in self.planes:
                 world = Formulas(world, symbols, names).after(pass_.outputs)
             holds.append(transition.condition(condition, world, HERE))

@@ -321,23 +321,6 @@ class Before:
         return self.symbols.terms.leaf("cell", self.tag, slot, y, x)
 
 
-class Reset:
-    """A world at the start of a step: some slots begin with their defaults."""
-
-    def __init__(self, before: World, symbols: Symbols) -> None:
-        self.before = before
-        rows = [row for row in symbols.layouts.values() if row.slot.resets]
-        self.bits = {
-            plane: int(row.slot.default) >> i & 1 for row in rows for i, plane in enumerate(row.planes)
-        }
-
-    def bit(self, plane: str, y: int, x: int) -> Literal:
-        return self.bits[plane] if plane in self.bits else self.before.bit(plane, y, x)
-
-    def real(self, slot: str, y: int, x: int) -> Term:
-        return self.before.real(slot, y, x)
-
-
 class Turned:
     """A world, ``mirrored`` left to right or ``rotated`` clockwise."""
 
@@ -375,11 +358,11 @@ class Turned:
 
 @dataclass(frozen=True)
 class Written:
-    """A world with some planes given by nodes, which `value` evaluates; the other planes are those of a world before."""
+    """A world with other contents in some planes, which `value` evaluates; the other planes are those of a world before."""
 
     before: World
-    writes: Mapping[str, Node]
-    value: Callable[[Node, int, int], int]
+    writes: Mapping[str, Any]
+    value: Callable[[Any, int, int], int]
 
     def bit(self, plane: str, y: int, x: int) -> Literal:
         node = self.writes.get(plane)
