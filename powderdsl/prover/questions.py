@@ -89,10 +89,10 @@ class Questions:
         if TRUE not in literals:
             self.solver.add_clause([self._number(literal) for literal in literals if literal != FALSE])
 
-    def ask(self, literals: Sequence[Literal], concerned: Sequence[int] | None = None) -> bool:
+    def ask(self, literals: Sequence[Literal], concerned: Sequence[int]) -> bool:
         """Return whether all of these can be true at once; `holds` then has their values. Raises OutOfWork.
 
-        `concerned`: the relevant gates, if known; all others follow from these or are free.
+        `concerned`: the relevant gates; all others follow from these or are free.
         """
         known = self.symbols.facts
         while self._facts < len(known):
@@ -101,8 +101,6 @@ class Questions:
         if FALSE in literals:
             return False
         assumptions = [self._number(literal) for literal in literals if literal != TRUE]
-        if concerned is None:
-            concerned = self.net.cone([*literals, *known])
         for _ in range(MAX_ROUNDS):
             self._model = {}
             if not self._solve(assumptions, concerned):

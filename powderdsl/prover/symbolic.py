@@ -187,8 +187,6 @@ class Symbols:
         self.general: list[Literal] = []
         """Facts about parameters and about the numbers of rows, columns and steps."""
         self.comparisons: dict[tuple[str, Term, Term], Literal] = {}
-        self.draws: dict[str, int] = {}
-        """The streams that were read, with the bits of their draws."""
         self.limit = limit
         self.turn: Callable[[Cell], Cell] | None = None
         """While a turned world is evaluated: the map from its cells to those of the other one."""
@@ -210,7 +208,6 @@ class Symbols:
         self.general.append(fact)
 
     def draw(self, stream: str, y: int, x: int, bits: int) -> list[Literal]:
-        self.draws[stream] = bits
         y, x = self.turn((y, x)) if self.turn else (y, x)
         return [self.net.variable("draw", stream, y, x, i) for i in range(bits)]
 
@@ -371,6 +368,13 @@ class Written:
     def real(self, slot: str, y: int, x: int) -> Term:
         node = self.writes.get(slot)
         return self.before.real(slot, y, x) if node is None else self.value(node, y, x)
+
+
+def reset(before: World, symbols: Symbols) -> Written:
+    """The world at the start of a step: some slots begin with their defaults."""
+    rows = [row for row in symbols.layouts.values() if row.slot.resets]
+    bits = {plane: int(row.slot.default) >> i & 1 for row in rows for i, plane in enumerate(row.planes)}
+    return Written(before, bits, lambda bit, y, x: bit)
 
 
 @dataclass(frozen=True)
