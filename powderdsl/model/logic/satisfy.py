@@ -57,7 +57,7 @@ class Budget:
             raise _Exhausted
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Facts:
     """The facts about cells: the existing ids, and the properties of the elements."""
 
@@ -67,13 +67,13 @@ class Facts:
     """Those that exist only on some elements read their default elsewhere."""
     side_multiple: int = 1
     """The sides of all worlds are multiples of this number."""
-    names: dict[int, str] = field(default_factory=dict, compare=False, repr=False)
+    names: dict[int, str] = field(default_factory=dict)
     """Names of the elements by id, for examples in messages."""
-    budget: Budget = field(default_factory=Budget, compare=False, repr=False)
+    budget: Budget = field(default_factory=Budget)
 
     @cached_property
-    def known(self) -> _Known:
-        """The part that equal facts share."""
+    def known(self) -> Facts:
+        """Facts of the same content, to which answers are kept: the same object for all of them."""
         return _known(
             self.ids, tuple(self.properties.items()), tuple(self.fields.items()), self.side_multiple
         )
@@ -153,23 +153,16 @@ def _ask(
             budget.left = max(budget.left, 0) + reserve
 
 
-class _Known:
-    """Facts to which answers are kept; a key by identity."""
-
-    def __init__(self, facts: Facts):
-        self.facts = facts
-
-
 @lru_cache(maxsize=64)
 def _known(
     ids: tuple[int, ...], properties: tuple[tuple[str, Property], ...], fields: tuple[tuple[str, Field], ...], side: int
-) -> _Known:  # fmt: skip
-    return _Known(Facts(ids, dict(properties), dict(fields), side))
+) -> Facts:  # fmt: skip
+    return Facts(ids, dict(properties), dict(fields), side)
 
 
 @lru_cache(maxsize=2048)
 def _answered(
-    known: _Known,
+    known: Facts,
     conditions: tuple[tuple[Expr, Offset], ...],
     lets: tuple[tuple[str, Expr], ...],
     most: int,
@@ -177,7 +170,7 @@ def _answered(
 ) -> tuple[Any, int]:
     """The answer to a question, and its work: editors ask the same after each key."""
     budget = Budget(most, most)
-    result = _ask(replace(known.facts, budget=budget), conditions, dict(lets), answer)
+    result = _ask(replace(known, budget=budget), conditions, dict(lets), answer)
     return result, most - max(budget.left, 0)
 
 
