@@ -98,13 +98,8 @@ class JsonSchema:
                 return entries(self.of(row.type), names=bool(row.type.NOUN))
             case "pairs":
                 return {"type": "object", "additionalProperties": SCALAR}
-            case "mapping":
-                return {"type": "object"}
-            case "list":
-                return {"type": "array"}
-            case "block":
-                return self._block()
-        return {}
+        assert row.shape == "block", f"`values` lacks {name}.{row.name}"
+        return self._block()
 
     def _block(self) -> Schema:
         """A rule, or a list of rules and blocks."""

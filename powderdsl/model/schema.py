@@ -402,11 +402,11 @@ class Reader:
             return ()
         return tuple(word for item in node.items if (word := self.single(item, "a word")))
 
-    def single(self, node: Node, wanted: str = "a single value", help_text: str = "") -> Scalar | None:
+    def single(self, node: Node, wanted: str = "a single value") -> Scalar | None:
         """A node that is a single value; None after reporting another one."""
         if isinstance(node, Scalar):
             return node
-        self.shape(node, wanted, help_text)
+        self.shape(node, wanted)
         return None
 
     def read_form(self, form: Form, key: str, word: Scalar) -> Any:
