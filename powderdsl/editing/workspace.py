@@ -130,7 +130,7 @@ class Workspace:
                     return reporter.diagnostics
                 case _:
                     known.model, remarks = load_with_diagnostics(*names, reuse=self.reuse)
-                    packs = known.model.declared.packs if known.model.declared else ()
+                    packs = known.model.declared.packs
         except CompileError as error:
             remarks = error.diagnostics
         known.read(names, packs)

@@ -185,17 +185,14 @@ def select_packs(ruleset: Ruleset, packs: Collection[str]) -> Ruleset | None:
 
 def without_pack(ruleset: Ruleset, pack: str) -> Ruleset | None:
     """The model without one pack and the packs that need it; None if the rest is not a ruleset."""
-    assert ruleset.declared is not None
     needs = needs_of({decl.name.text: decl for decl in ruleset.declared.packs})
     return select_packs(ruleset, [name for name in needs if pack not in needs[name]])
 
 
 def _check_some(
-    declared: Declared | None, packs: Collection[str], reporter: Reporter, *, alone: bool = False
+    declared: Declared, packs: Collection[str], reporter: Reporter, *, alone: bool = False
 ) -> Ruleset | None:
     """The model of some packs; None after reporting why they are not a ruleset of their own."""
-    if declared is None:
-        return None
     gone = {pack.name.text for pack in declared.packs} - set(packs)
     chosen = [pack for pack in declared.packs if pack.name.text not in gone]
     try:
@@ -223,7 +220,7 @@ def demote_outgrown(ruleset: Ruleset, remarks: tuple[Diagnostic, ...]) -> tuple[
         and (span := remark.primary.span)
         and remark.code not in OF_COMPOSITIONS
     }
-    if not warnings or ruleset.declared is None or len(ruleset.packs) < 2:
+    if not warnings or len(ruleset.packs) < 2:
         return remarks
     composition = compose(ruleset.declared.packs, ruleset.declared.ruleset, Reporter())
     notes: dict[Diagnostic, Diagnostic] = {}

@@ -495,7 +495,7 @@ class Ruleset:
     invariants: tuple[Invariant, ...] = field(default=(), metadata=UNMEANING)
     side_multiple: int = field(default=1, metadata=UNMEANING)
     """The rows and columns of all worlds are multiples of this number."""
-    declared: Declared | None = field(default=None, compare=False, repr=False)
+    declared: Declared = field(default=Declared((), None), compare=False, repr=False)
     """The files that it was checked from."""
 
     def added_to(self, scope: tuple[str, ...]) -> tuple[str, ...]:
@@ -509,7 +509,7 @@ class Ruleset:
     @cached_property
     def text_key(self) -> str:
         """A text that differs if two rulesets differ in anything, including locations in files."""
-        return fingerprint(replace(self, declared=None), whole=True)
+        return fingerprint(replace(self, declared=Ruleset.declared), whole=True)
 
     @property
     def palette(self) -> tuple[str | None, ...]:

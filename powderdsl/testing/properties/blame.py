@@ -151,7 +151,6 @@ def pack_changes(pack: str, ruleset: Ruleset, near: frozenset[str]) -> list[Caus
 
 def _changes(pack: str, ruleset: Ruleset) -> Iterator[tuple[str, Cause]]:
     """The changes that a pack makes, each after the name of the changed element, if any."""
-    assert ruleset.declared is not None
     decl: PackDecl = next(pack_decl for pack_decl in ruleset.declared.packs if pack_decl.name.text == pack)
     for element in decl.elements:
         name, does = element.name.text, "replaces" if element.override else "brings"
