@@ -93,10 +93,6 @@ class Workspace:
     def text(self, path: Path) -> str:
         return OPEN[path.resolve()]
 
-    def kind(self, path: Path) -> str:
-        """The key that determines the kind of a file; `pack` if there is none yet."""
-        return kind_of(self.text(path))
-
     # Mistakes
 
     def check(self, path: Path) -> tuple[Diagnostic, ...]:
@@ -110,7 +106,7 @@ class Workspace:
         names = [name for name in (self.beside, str(path)) if name]
         packs: Sequence[PackDecl] = ()
         try:
-            match self.kind(path):
+            match kind_of(self.text(path)):
                 case "task":
                     from powderdsl.tasks.shipped import load_task_with_diagnostics
 

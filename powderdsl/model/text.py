@@ -15,7 +15,6 @@ from powderdsl.model.operations import COMPARISONS, OPERATIONS
 from powderdsl.model.schema import Record
 from powderdsl.model.types import (
     Assign,
-    Element,
     Expr,
     Field,
     Kernel,
@@ -162,18 +161,6 @@ def show_expr(ruleset: Ruleset, expr: Expr) -> str:
     return _Printer(ruleset).expr(expr)
 
 
-def tint_text(item: Field) -> str:
-    """The tint of a field after a space, or an empty string."""
-    tint = item.tint
-    return f" tint {tint.color} full {tint.full} most {tint.most:g}" if tint else ""
-
-
-def ramp_text(element: Element) -> str:
-    """The color ramp of an element after a space, or an empty string."""
-    ramp = element.ramp
-    return f" {ramp.start} -> {ramp.end} by {ramp.field} {ramp.lo}..{ramp.hi}" if ramp else ""
-
-
 class _Printer:
     """Prints one ruleset, and collects its kernels to name and list them."""
 
@@ -191,8 +178,9 @@ class _Printer:
         yield f"matrix {' '.join(channel.name or '-' for channel in rules.matrix)}"
         for element in rules.elements:
             tags = f" tags {' '.join(sorted(element.tags))}" if element.tags else ""
-            color = f"{element.color}{ramp_text(element)}"
-            head = f"element {element.id} {element.qualified} {element.glyph} {color}{tags}"
+            ramp = element.ramp
+            color = f" {ramp.start} -> {ramp.end} by {ramp.field} {ramp.lo}..{ramp.hi}" if ramp else ""
+            head = f"element {element.id} {element.qualified} {element.glyph} {element.color}{color}{tags}"
             yield self.with_place(head, element.span)
         for prop in rules.properties:
             values = ", ".join(
@@ -219,7 +207,8 @@ class _Printer:
             f", {element_name(self.ruleset, identity)} {show_value(self.ruleset, item.kind, value)}"
             for identity, value in item.own
         )
-        return f"{item.name} {item.kind} at {item.at}{of} default {default}{own}{resets}{tint_text(item)}"
+        tint = f" tint {item.tint.color} full {item.tint.full} most {item.tint.most:g}" if item.tint else ""
+        return f"{item.name} {item.kind} at {item.at}{of} default {default}{own}{resets}{tint}"
 
     def kernel_lines(self) -> list[str]:
         """A line for each printed kernel: its name, and the weight of each neighbor."""
