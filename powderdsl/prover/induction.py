@@ -184,11 +184,8 @@ class Prover:
     def transitions(self, number: int, *, cut: bool) -> list[Transition]:
         """The substeps of a pass, from any well-formed world if `cut`; otherwise from the results of earlier ones,
         followed by the pass as a whole."""
-        if (number, cut) not in self._transitions:
-            self._transitions[number, cut] = self._make_transitions(number, cut)
-        return self._transitions[number, cut]
-
-    def _make_transitions(self, number: int, cut: bool) -> list[Transition]:
+        if (number, cut) in self._transitions:
+            return self._transitions[number, cut]
         transitions = []
         pass_, ranges = self.planes[number], self.ranges[number + cut]
         state, known = dict[str, Node](), dict[Node, tuple[str, str]]()
@@ -212,7 +209,7 @@ class Prover:
                 if node.op not in ("input", "const"):
                     known.setdefault(node, (f"{place}", plane))
         whole = Transition(pass_.name, symbols, (begin,), begin, transitions[-1].after, ranges)
-        return transitions if cut else [*transitions, whole]
+        return self._transitions.setdefault((number, cut), transitions if cut else [*transitions, whole])
 
     def broken(self, claim: Claim, without: frozenset[int] = frozenset()) -> Transition | None:
         """Return None if the claim is proven for worlds that start without some elements; else a transition that may
@@ -263,11 +260,8 @@ class Prover:
 
     def reachable(self, gone: frozenset[int]) -> Law:
         """Return the law that limits the elements of cells and fields if worlds start without some."""
-        if gone not in self._laws:
-            self._laws[gone] = self._make_law(gone)
-        return self._laws[gone]
-
-    def _make_law(self, gone: frozenset[int]) -> Law:
+        if gone in self._laws:
+            return self._laws[gone]
         rows = [row for row in self.start.symbols.layouts.values() if row.slot.kind.name == "element"]
         known = set(self.start.symbols.ids) - gone
         # A field's usual element, absent or not, is in fresh cells and in cells that can contain no other.
@@ -282,7 +276,7 @@ class Prover:
             for row in rows:
                 bits = map(transition.questions.holds, row.bits(transition.after, *HERE))
                 allowed[row.slot.name].add(sum(bit << i for i, bit in enumerate(bits)))
-        return law
+        return self._laws.setdefault(gone, law)
 
     def _never_for(self, claim: Never, given: Laws) -> Transition | None:
         """Return whether a condition can hold in a cell for several successive steps."""
