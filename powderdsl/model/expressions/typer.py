@@ -139,19 +139,6 @@ class Typer:
     def evaluate(self, syntax: Syntax, scope: Scope) -> Operand:
         """The operand of some syntax. Raises Poisoned after reporting, Unresolved if it depends on an absent name."""
         self.spend(1, syntax.span)
-        match syntax.kind:
-            case "yes":
-                return TRUE
-            case "no":
-                return FALSE
-            case "integer" | "decimal" | "percent":
-                return number(read_number(syntax, self))
-            case "range":
-                return Bounds(*read_bounds(syntax, self))
-            case "any":
-                return SetOf(tuple(self.symbols.names_by_id))
-            case "not_":
-                return negation(self.condition(syntax.children[0], scope), syntax.span)
         return HANDLERS[syntax.kind](self, syntax, scope)
 
     def operands(self, syntax: Syntax, scope: Scope) -> list[Operand]:
@@ -710,6 +697,14 @@ def _integer_helps(value: Expr, span: Span) -> tuple[str, ...]:
 
 
 HANDLERS: dict[str, Callable[[Typer, Syntax, Scope], Operand]] = {
+    "yes": lambda typer, syntax, scope: TRUE,
+    "no": lambda typer, syntax, scope: FALSE,
+    **dict.fromkeys(
+        ("integer", "decimal", "percent"), lambda typer, syntax, scope: number(read_number(syntax, typer))
+    ),
+    "range": lambda typer, syntax, scope: Bounds(*read_bounds(syntax, typer)),
+    "any": lambda typer, syntax, scope: SetOf(tuple(typer.symbols.names_by_id)),
+    "not_": lambda typer, syntax, scope: negation(typer.condition(syntax.children[0], scope), syntax.span),
     "name": Typer.name,
     "optional_name": Typer.optional_name,
     "attribute": Typer.attribute,
@@ -725,4 +720,4 @@ HANDLERS: dict[str, Callable[[Typer, Syntax, Scope], Operand]] = {
     **dict.fromkeys(("add", "sub", "mul", "div", "quotient", "neg"), calculation),
     "mod": modulo,
 }
-"""The function that evaluates each kind of syntax node with parts."""
+"""The function that evaluates each kind of syntax node."""
