@@ -19,7 +19,7 @@ TEXT = re.compile(r'(^|\s)#.*$|\babout:\s*("[^"]*"|[^,}\n]*)', re.MULTILINE)
 
 @dataclass(frozen=True)
 class Word:
-    """A word of the rules. `span` is its definition in a file; words of the language have none."""
+    """A word of the rules, or a completion. `span` is its definition in a file; words of the language have none."""
 
     name: str
     kind: str

@@ -20,7 +20,7 @@ from powderdsl.model.schema import NAME
 from powderdsl.model.types import Ruleset
 from powderdsl.syntax.parse import reserved_words
 from powderdsl.syntax.sources import OPEN, read_source, shipped
-from powderdsl.syntax.yaml_tree import Mapping, Node, Scalar, parse_yaml
+from powderdsl.syntax.yaml_tree import Node, parse_yaml
 
 if TYPE_CHECKING:
     from powderdsl.experiments.studies.study import Commands
@@ -28,25 +28,6 @@ if TYPE_CHECKING:
 KIND = re.compile(r"^(pack|ruleset|task|study|scenes?):", re.MULTILINE)
 PACKS = ("needs", "packs", "without", "provides", "conflicts", "extends", "rules", "rulesets")
 """Keys whose values name packs or rulesets."""
-
-
-@dataclass(frozen=True)
-class Item:
-    """A completion: a word, its kind, and its meaning."""
-
-    label: str
-    kind: str
-    about: str = ""
-
-
-@dataclass(frozen=True)
-class Symbol:
-    """An entry of the outline: a key, its line, and what is below it."""
-
-    name: str
-    span: Span
-    whole: Span
-    below: tuple[Symbol, ...] = ()
 
 
 @dataclass
@@ -134,7 +115,7 @@ class Workspace:
 
     # At a place
 
-    def complete(self, path: Path, offset: int) -> list[Item]:
+    def complete(self, path: Path, offset: int) -> list[Word]:
         """The words that are allowed at a place."""
         beside = sorted(other.stem for other in path.parent.glob("*.yaml") if other != path)
         return completions(self.text(path), offset, self._rules(path), beside)
@@ -177,10 +158,10 @@ class Workspace:
                 raise ValueError(f"{span.source.name} comes with powderdsl and uses this name")
         return spans
 
-    def outline(self, path: Path) -> tuple[Symbol, ...]:
-        """The sections of a file and their entries."""
+    def outline(self, path: Path) -> Node | None:
+        """The sections of a file and their entries; None if it cannot be read."""
         source = read_source(path, Reporter())
-        return _symbols(parse_yaml(source, Reporter()) if source else None, 2)
+        return parse_yaml(source, Reporter()) if source else None
 
     def _rules(self, path: Path) -> Rules:
         if path not in self.rules:
@@ -194,23 +175,23 @@ def kind_of(text: str) -> str:
     return match[1] if match else "pack"
 
 
-def completions(text: str, offset: int, rules: Rules, beside: Iterable[str]) -> list[Item]:
+def completions(text: str, offset: int, rules: Rules, beside: Iterable[str]) -> list[Word]:
     """The words that are allowed at a place of a text. `beside` are allowed packs, in addition to shipped ones."""
     cursor, kind = cursor_at(text, offset), kind_of(text)
     if cursor.key is None and (keys := keys_at(cursor.path, kind)):
-        return [Item(key, "key", about) for key, about in keys.items()]
+        return [Word(key, "key", about) for key, about in keys.items()]
     if choices := values_at(cursor.keys, kind):
-        return [Item(choice, "value") for choice in choices]
+        return [Word(choice, "value") for choice in choices]
     last = cursor.keys[-1] if cursor.keys else ""
     if last in PACKS:
-        return [Item(name, "pack") for name in dict.fromkeys([*beside, *shipped_rules()])]
+        return [Word(name, "pack") for name in dict.fromkeys([*beside, *shipped_rules()])]
     words = [entry for entries in rules.words.values() for entry in entries]
     if last in ("tags", "after", "before"):
         wanted = "tag" if last == "tags" else "pass"
         words = [word for word in words if word.kind == wanted]
     elif last == "about":
         words = []
-    return [Item(word.name, word.kind, word.about) for word in words if word.kind != "pass" or last != "do"]
+    return [word for word in words if word.kind != "pass" or last != "do"]
 
 
 def explanation(source: Source, offset: int, rules: Rules) -> tuple[str, Span] | None:
@@ -234,20 +215,6 @@ def _namespace(cursor: Cursor) -> str:
         return "pack"
     is_pass = (cursor.path == ("passes",) and cursor.key is None) or cursor.key in ("after", "before")
     return "pass" if is_pass else "name"
-
-
-def _symbols(node: Node | None, depth: int) -> tuple[Symbol, ...]:
-    if depth == 0 or node is None or isinstance(node, Scalar):
-        return ()
-    parts = (
-        node.entries
-        if isinstance(node, Mapping)
-        else [entry for item in node.items if isinstance(item, Mapping) for entry in item.entries[:1]]
-    )
-    return tuple(
-        Symbol(key.text, key.span, key.span.to(value.span), _symbols(value, depth - 1))
-        for key, value in parts
-    )
 
 
 def _described(word: Word, model: Ruleset | None) -> str:

@@ -93,7 +93,8 @@ class Session:
     def complete(self, text: str, offset: int) -> list[dict[str, str]]:
         """The words that are allowed at a place of a file, as the language server offers them."""
         beside = [pack.name.text for pack in self.known.packs]
-        return [vars(item) for item in completions(text, offset, self.known, beside)]
+        words = completions(text, offset, self.known, beside)
+        return [{"label": word.name, "kind": word.kind, "about": word.about} for word in words]
 
     def explain(self, text: str, offset: int) -> str:
         """The meaning of the word at a place of a file, as Markdown."""

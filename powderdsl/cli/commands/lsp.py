@@ -16,7 +16,7 @@ from powderdsl.system.packages import require
 
 if TYPE_CHECKING:
     from powderdsl.diagnostics import Diagnostic, Source, Span
-    from powderdsl.editing.workspace import Symbol
+    from powderdsl.syntax.yaml_tree import Node
 
 
 @click.command("lsp")
@@ -44,6 +44,7 @@ def server(beside: str = "") -> Any:
     from powderdsl.diagnostics import Reporter, Severity, Source
     from powderdsl.editing.layout import formatted
     from powderdsl.editing.workspace import Workspace
+    from powderdsl.syntax.yaml_tree import Mapping, Scalar
     from powderdsl.system import cache
 
     cache.STORED = False  # each key would store a model
@@ -145,15 +146,15 @@ def server(beside: str = "") -> Any:
     @served.feature(lsp.TEXT_DOCUMENT_COMPLETION, lsp.CompletionOptions())
     def complete(params: lsp.CompletionParams) -> list[lsp.CompletionItem]:
         path = path_of(params.text_document)
-        items = files.complete(path, offset(path, params.position))
+        words = files.complete(path, offset(path, params.position))
         return [
             lsp.CompletionItem(
-                item.label,
-                kind=kinds.get(item.kind, lsp.CompletionItemKind.Keyword),
-                detail=item.kind,
-                documentation=item.about or None,
+                word.name,
+                kind=kinds.get(word.kind, lsp.CompletionItemKind.Keyword),
+                detail=word.kind,
+                documentation=word.about or None,
             )
-            for item in items
+            for word in words
         ]
 
     @served.feature(lsp.TEXT_DOCUMENT_HOVER)
@@ -214,21 +215,24 @@ def server(beside: str = "") -> Any:
                 actions.append(lsp.CodeAction(title, kind, [as_lsp(diagnostic)], edit=edit))
         return actions
 
-    def symbols(parts: Sequence[Symbol]) -> list[lsp.DocumentSymbol]:
-        return [
-            lsp.DocumentSymbol(
-                part.name[:80],
-                lsp.SymbolKind.Field if not part.below else lsp.SymbolKind.Namespace,
-                between(part.whole),
-                between(part.span),
-                children=symbols(part.below),
-            )
-            for part in parts
-        ]
+    def symbols(node: Node | None, depth: int) -> list[lsp.DocumentSymbol]:
+        if depth == 0 or node is None or isinstance(node, Scalar):
+            return []
+        items = [item for item in node.items if isinstance(item, Mapping)]
+        entries = (
+            node.entries if isinstance(node, Mapping) else [e for item in items for e in item.entries[:1]]
+        )
+        found = []
+        for key, value in entries:
+            below = symbols(value, depth - 1)
+            sort = lsp.SymbolKind.Namespace if below else lsp.SymbolKind.Field
+            whole = between(key.span.to(value.span))
+            found.append(lsp.DocumentSymbol(key.text[:80], sort, whole, between(key.span), children=below))
+        return found
 
     @served.feature(lsp.TEXT_DOCUMENT_DOCUMENT_SYMBOL)
     def outline(params: lsp.DocumentSymbolParams) -> list[lsp.DocumentSymbol]:
-        return symbols(files.outline(path_of(params.text_document)))
+        return symbols(files.outline(path_of(params.text_document)), 2)
 
     @served.feature(lsp.TEXT_DOCUMENT_FORMATTING)
     def layout(params: lsp.DocumentFormattingParams) -> list[lsp.TextEdit]:
