@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import unicodedata
-from collections.abc import Set
+from collections.abc import Mapping, Set
 from difflib import get_close_matches
 
 TERMINAL_WORDS = {
@@ -15,24 +15,9 @@ TERMINAL_WORDS = {
     "PERCENT": "a percentage",
     "UPDATE": "`:=`",
     "COMPARE": "a comparison",
-    "LPAR": "`(`",
-    "RPAR": "`)`",
-    "COMMA": "`,`",
-    "DOT": "`.`",
-    "PLUS": "`+`",
-    "MINUS": "`-`",
-    "STAR": "`*`",
-    "SLASH": "`/`",
-    "QMARK": "`?`",
-    "_ARROW": "`->`",
-    "_DOTS": "`..`",
-    "_COLON": "`:`",
-    "_ASSIGN": "`:=`",
-    "_PERCENT_SIGN": "`%`",
-    "_END": "`end`",
     "$END": "the end of the line",
 }
-"""The name of each terminal in messages, except keywords, which name themselves."""
+"""The name in messages of each terminal that stands for several texts."""
 
 _VALUE_STARTS = {"NAME", "INTEGER", "LPAR"}
 _LITERALS = {"DECIMAL", "PERCENT", "YES", "NO", "TRUE", "FALSE"}
@@ -173,10 +158,11 @@ _PHRASES: tuple[tuple[str, str, str], ...] = (
 terminal that could have followed; the fix. The first match counts."""
 
 
-def token_help(token: str, accepted: Set[str], before: str, cut: bool) -> str:
+def token_help(token: str, accepted: Set[str], fixed: Mapping[str, str], before: str, cut: bool) -> str:
     """The fix for an unexpected word. `token` is empty at the end of the line.
 
-    `accepted` are the terminals that could follow, `before` is the line up to the error.
+    `accepted` are the terminals that could follow, `fixed` are the texts of terminals that have only one, `before` is the
+    line up to the error.
     """
     if cut and not (token and before.strip()):
         return CUT
@@ -192,13 +178,13 @@ def token_help(token: str, accepted: Set[str], before: str, cut: bool) -> str:
     instead = _WORDS.get(token.lower(), "")
     if instead and token != instead:
         return f"write `{instead}`"
-    keywords = {name.lower() for name in accepted if name.isalpha() and name not in TERMINAL_WORDS}
+    keywords = {fixed[name] for name in accepted & fixed.keys() if name.isalpha() and fixed[name].isalpha()}
     close = get_close_matches(token.lower(), sorted(keywords - {token}), n=1, cutoff=0.7)
     return f"did you mean `{close[0]}`?" if close else ""
 
 
-def expected_words(accepted: Set[str]) -> str:
-    """The terminals that could have followed, in words."""
+def expected_words(accepted: Set[str], fixed: Mapping[str, str]) -> str:
+    """The terminals that could have followed, in words. `fixed` is as in `token_help`."""
     words = set()
     rest = set(accepted)
     if _VALUE_STARTS <= rest:
@@ -207,6 +193,6 @@ def expected_words(accepted: Set[str]) -> str:
     if len(rest & _OPERATORS) > 3:
         words.add("an operator")
         rest -= _OPERATORS | {"DOT", "QMARK", "LPAR", "COMMA", "AND", "OR"}
-    words |= {TERMINAL_WORDS.get(name, f"`{name.lower()}`") for name in rest}
+    words |= {TERMINAL_WORDS.get(name) or f"`{fixed[name]}`" for name in rest}
     listed = sorted(words)[:8]
     return " or ".join(filter(None, [", ".join(listed[:-1]), listed[-1]])) if listed else ""

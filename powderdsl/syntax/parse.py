@@ -88,10 +88,14 @@ def parser(language: Language = RULES) -> Lark:
 @cache
 def reserved_words(language: Language = RULES) -> frozenset[str]:
     """The keywords of a language, which cannot be names."""
-    patterns = [terminal.pattern for terminal in parser(language).terminals]
-    return frozenset(
-        pattern.value for pattern in patterns if pattern.type == "str" and pattern.value.isalpha()
-    )
+    return frozenset(filter(str.isalpha, fixed_terminals(language).values()))
+
+
+@cache
+def fixed_terminals(language: Language) -> dict[str, str]:
+    """The terminals of a language that have only one text, and this text."""
+    terminals = parser(language).terminals
+    return {terminal.name: terminal.pattern.value for terminal in terminals if terminal.pattern.type == "str"}
 
 
 def line_of(node: Node | None, start: str, reporter: Reporter) -> Span | None:
@@ -188,10 +192,10 @@ def _report_syntax_error(
     place = len(text[: line.end].rstrip()) if is_lost else line.start + token.start_pos
     start = min(max(place, line.start), max(len(text) - 1, 0))
     stop = start + (1 if at_end else len(token))
-    accepted = set(error.accepts or error.expected or ())
-    expected = expected_words(accepted)
+    accepted, fixed = set(error.accepts or error.expected or ()), fixed_terminals(language)
+    expected = expected_words(accepted, fixed)
     cut = was_cut(text, line.start, line.end)
-    fix = token_help("" if at_end else str(token), accepted, text[line.start : start], cut)
+    fix = token_help("" if at_end else str(token), accepted, fixed, text[line.start : start], cut)
     helps = [CUT] if cut and usage else usage or ([fix] if fix else [])
     message = "the line ends too early" if at_end else f"unexpected `{token}`"
     span, label = Span(source, start, max(stop, start + 1)), f"expected {expected}" if expected else ""
