@@ -45,10 +45,6 @@ class Rules:
             for word in (*language_words(), *definitions(packs)):
                 self.words.setdefault(word.name, []).append(word)
 
-    @property
-    def sources(self) -> list[Source]:
-        return [pack.source for pack in self.packs]
-
 
 class Workspace:
     """The open files.
@@ -139,7 +135,7 @@ class Workspace:
         if not any(entry.span is not None for entry in rules.words.get(cursor.word, ())):
             return []
         own = _namespace(cursor)
-        places = occurrences(cursor.word, rules.sources)
+        places = occurrences(cursor.word, (pack.source for pack in rules.packs))
         return [span for span in places if _namespace(cursor_at(span.source.text, span.start)) == own]
 
     def rename(self, path: Path, offset: int, name: str) -> list[Span]:

@@ -147,10 +147,6 @@ class KernelDecl(Definition, noun="a kernel"):
         choices=("nothing", "wrap"),
     )
 
-    @property
-    def wrap(self) -> bool:
-        return self.edges == "wrap"
-
 
 class StreamDecl(Definition, noun="a stream"):
     bits: int = keyed("the bits of a draw", 16, choices=("16", "32"))

@@ -119,7 +119,7 @@ def _shaped_kernel(name: str, decl: KernelDecl, shape: Syntax, typer: Typer) -> 
         if not isinstance(kernel, Kernel):
             fix = "such as `box(5)`, or rows of weights"
             raise typer.wrong(kernel, "a shape with its radius", shape.span, fix)
-        return replace(kernel, name=name, wrap=decl.wrap)
+        return replace(kernel, name=name, wrap=decl.edges == "wrap")
     except (Poisoned, Unresolved):
         return Broken()
 

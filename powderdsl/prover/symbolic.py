@@ -20,8 +20,6 @@ from powderdsl.model.types import Ruleset
 from powderdsl.prover.net import FALSE, TRUE, Literal, Net
 from powderdsl.prover.solver import OutOfWork
 
-NAMELESS = ("",)
-
 LEAVES = ("const", "param", "draw")
 """Operations whose terms have no parts."""
 
@@ -267,8 +265,8 @@ class Symbols:
         """The cells of worlds of variables that are among some gates, with the planes that are read there."""
         cells: dict[Cell, dict[str, None]] = {}
         for number in gates:
-            name = self.net.names.get(number, NAMELESS)
-            if name[0] == "cell":
+            name = self.net.names.get(number)
+            if name and name[0] == "cell":
                 _, _, plane, y, x = name
                 cells.setdefault((y, x), {})[plane] = None
         return cells

@@ -238,9 +238,8 @@ def compose(
     groups = _groups(loaded, ruleset)
     requests = [_id_requests(group, names, reporter) for group in groups]
     natural = _ids(requests, names, ruleset is not NO_RULESET)
-    every_request = [*chain.from_iterable(requests)]
     ids = _ids(requests, names, ruleset is not NO_RULESET, palette) if palette else natural
-    _report_ids(every_request, ids, names, reporter, recorded=palette is not None)
+    _report_ids([*chain.from_iterable(requests)], ids, names, reporter, recorded=palette is not None)
     elements = _elements(declared, ids, reporter)
     wanted = ruleset.layout_ruleset.slots or 0
     own = max((ids.get(decl.qualified, -1) for decl in requests[0]), default=-1) + 1 if requests else 0

@@ -38,7 +38,7 @@ def add_constants(composition: Composition) -> None:
     constants |= KERNELS
     for name, kernel in names.declared(KernelDecl).items():
         if kernel.shape is None:
-            constants[name] = grid_kernel(name, kernel.rows, kernel.wrap)
+            constants[name] = grid_kernel(name, kernel.rows, kernel.edges == "wrap")
     constants |= {name: SetOf((element.id,), name) for name, element in elements.items()}
     for tag in names.declared(TagDecl):
         constants[tag] = SetOf(tuple(element.id for element in elements.values() if tag in element.tags))
