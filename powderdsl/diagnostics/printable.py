@@ -1,7 +1,7 @@
 """Escaping of text from files and arguments: terminals interpret some characters, and others are invisible.
 
 `PrintableStream` wraps stdout and stderr while a command runs, so that all output is escaped. Code that
-draws on the terminal writes to `unguarded(stream)` and escapes the text in its drawing with `printable` itself.
+draws on the terminal writes to `raw_stream(stream)` and escapes the text in its drawing with `printable` itself.
 """
 
 from __future__ import annotations
@@ -43,12 +43,6 @@ def printable(text: str, *, lines: bool = False) -> str:
     )
 
 
-def styled(text: str) -> str:
-    """A text escaped by `printable`, except colors. Text from files must be escaped before."""
-    pieces = _STYLE.split(text)
-    return "".join(piece if at % 2 else printable(piece, lines=True) for at, piece in enumerate(pieces))
-
-
 def _escaped(char: str) -> str:
     units = char.encode("utf-16-be", "surrogatepass")
     return "".join(f"\\u{units[at : at + 2].hex()}" for at in range(0, len(units), 2))
@@ -68,7 +62,7 @@ def spell(word: str) -> str:
 
 
 def look_alikes(word: str) -> tuple[str, ...]:
-    """The distinct characters of a word that may be confused with others, in order; see `character_name`."""
+    """The distinct characters of a word that may be confused with others, in order."""
     mixed = any(char.isascii() and char.isalpha() for char in word)
     odd = (
         char
@@ -82,14 +76,11 @@ def look_alikes(word: str) -> tuple[str, ...]:
     return tuple(dict.fromkeys(odd))
 
 
-def character_name(char: str) -> str:
-    """``U+0430 CYRILLIC SMALL LETTER A``."""
-    return f"U+{ord(char):04X} {unicodedata.name(char, 'without a name')}"
-
-
 def shown_character(char: str) -> str:
-    """A character in a message, with its name if it is not ASCII."""
-    return f"`{char}`" if char.isascii() else f"`{printable(char)}` ({character_name(char)})"
+    """A character in a message, if it is not ASCII with its name: ``U+0430 CYRILLIC SMALL LETTER A``."""
+    if char.isascii():
+        return f"`{char}`"
+    return f"`{printable(char)}` (U+{ord(char):04X} {unicodedata.name(char, 'without a name')})"
 
 
 # Streams
@@ -132,5 +123,6 @@ def raw_stream(stream: Any) -> Any:
 
 
 def write_styled(stream: Any, text: str) -> None:
-    """Write a text with our own colors to any stream: see `styled`."""
-    raw_stream(stream).write(styled(text))
+    """Write a text to any stream, escaped by `printable` except for colors. Text from files must be escaped before."""
+    pieces = enumerate(_STYLE.split(text))
+    raw_stream(stream).write("".join(text if at % 2 else printable(text, lines=True) for at, text in pieces))

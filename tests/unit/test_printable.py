@@ -20,7 +20,7 @@ from powderdsl.diagnostics.printable import (
     printable_streams,
     raw_stream,
     spell,
-    styled,
+    write_styled,
 )
 from tests.cli.commands import powderdsl
 
@@ -53,8 +53,12 @@ def test_json_stays_the_same_json():
 
 
 def test_only_colors_pass_as_styles():
-    assert styled("\x1b[31;1mred\x1b[0m") == "\x1b[31;1mred\x1b[0m"
-    assert not RAW.search(styled("\x1b[2J\x1b]8;;x\x07\x1b[?25l\x9b31m"))
+    stream = io.StringIO()
+    write_styled(stream, "\x1b[31;1mred\x1b[0m")
+    assert stream.getvalue() == "\x1b[31;1mred\x1b[0m"
+    stream = io.StringIO()
+    write_styled(stream, "\x1b[2J\x1b]8;;x\x07\x1b[?25l\x9b31m")
+    assert not RAW.search(stream.getvalue())
 
 
 @pytest.mark.parametrize(
