@@ -61,11 +61,6 @@ class Kind:
                 return f"{self.name}({self.lo:g}..{self.hi:g})" if self.hi > self.lo else self.name
         return self.name
 
-    @property
-    def reach(self) -> float:
-        """The largest magnitude."""
-        return max(abs(self.lo), abs(self.hi))
-
 
 FLAG, ELEMENT, DIRECTION, CHANCE = Kind("flag"), Kind("element"), Kind("direction"), Kind("chance")
 REAL, VEC2, DRAW = Kind("real"), Kind("vec2"), Kind("draw", 0, 1)
@@ -519,9 +514,6 @@ class Ruleset:
 
     def property(self, name: str) -> Property | None:
         return next((p for p in self.properties if p.name == name), None)
-
-    def field(self, name: str) -> Field | None:
-        return next((f for f in self.fields if f.name == name), None)
 
     def with_params(self, values: dict[str, Value]) -> Ruleset:
         """The ruleset with other defaults of parameters, which `definitions.set_params` has checked."""

@@ -122,8 +122,8 @@ def test_defaults_of_fields_follow_the_same_rules() -> None:
     heat = "needs: [core, sand]\nfields:\n  heat: {type: 0..9, at: element, sand: 3}\n"
     hot, warm = ("needs: [core, heat]\nalso:\n  sand?: {heat: %d}\n" % n for n in (5, 4))  # noqa: UP031
     ruleset, found = loaded("core+sand+heat.yaml+hot.yaml+warm.yaml", heat=heat, hot=hot, warm=warm)
-    field, sand = ruleset.field("heat"), ruleset.element("sand")
-    assert field.own == ((sand.id, 3),)
+    (field,) = [field for field in ruleset.fields if field.name == "heat"]
+    assert field.own == ((ruleset.element("sand").id, 3),)
     assert {code for code, _ in found} == {"PD316"}
 
 

@@ -34,6 +34,11 @@ REALS = ("0", "0.5", "1", "-1", "0.1", "-0.75", "9")
 """Floats as they are written in declarations, if the range allows."""
 
 
+def _reach(kind: Kind) -> float:
+    """The largest magnitude."""
+    return max(abs(kind.lo), abs(kind.hi))
+
+
 @dataclass(frozen=True)
 class Manner:
     """Features of a random ruleset. Tests of single properties leave out what would break the property."""
@@ -105,7 +110,7 @@ class Vocabulary:
         choices = self.choices
         kind = choices.pick([CHANCE, integer(0, 7), FLAG, integer(-300, 300), Kind("real", -10, 10)])
         self.params[name] = kind
-        self._bind(name, f"{kind.name} param", reach=kind.reach)
+        self._bind(name, f"{kind.name} param", reach=_reach(kind))
         value = self._literal(kind)
         is_inferred = kind == FLAG or value.endswith("%")
         return value if is_inferred and choices.maybe(50) else {"type": str(kind), "default": value}
@@ -114,7 +119,7 @@ class Vocabulary:
         choices = self.choices
         kind = weighted(choices, [(4, integer(0, 7)), (3, FLAG), (2, CHANCE), (2, some_range(choices))])
         self.properties[name] = kind
-        self._bind(name, f"{kind.name} property", f"{kind.name} name", reach=kind.reach)
+        self._bind(name, f"{kind.name} property", f"{kind.name} name", reach=_reach(kind))
         return str(kind) if choices.maybe(30) else {"type": str(kind), "default": self._literal(kind)}
 
     def _field(self, name: str) -> Tree:
@@ -123,7 +128,7 @@ class Vocabulary:
         floats = [(3, Kind("real", choices.pick([-bound, 0]), bound)), (3, Kind("vec2", -bound, bound))]
         kind = weighted(choices, [(4, some_range(choices)), (3, FLAG), (2, ELEMENT), (2, DIRECTION), *floats])
         self.fields[name] = kind
-        self._bind(name, f"{kind.name} field", f"{kind.name} name", reach=kind.reach)
+        self._bind(name, f"{kind.name} field", f"{kind.name} name", reach=_reach(kind))
         entry: dict[str, Tree] = {"type": str(kind), "at": choices.pick(["element", "place"])}
         if kind == ELEMENT or choices.maybe(40):
             entry["default"] = self._literal(kind)
@@ -270,7 +275,7 @@ class PassMaker:
             kind = choices.pick([*kinds, ELEMENT] if 0 in self.words.ids else kinds)
             name = self._name("x")
             self.scratch[name] = kind
-            phrases = phrases.bound(name, f"{kind.name} field", f"{kind.name} name", reach=kind.reach)
+            phrases = phrases.bound(name, f"{kind.name} field", f"{kind.name} name", reach=_reach(kind))
         if self.scratch:
             tree["scratch"] = {name: str(kind) for name, kind in self.scratch.items()}
         return {**tree, **self.block(phrases, 2, MAX_ROUNDS, None, False)}
@@ -303,7 +308,7 @@ class PassMaker:
             if value is not None:
                 name = self._name("v")
                 lets[name] = value.text
-                phrases = phrases.bound(name, f"{kind.name} name", f"{kind.name} let", reach=kind.reach)
+                phrases = phrases.bound(name, f"{kind.name} name", f"{kind.name} let", reach=_reach(kind))
         if lets:
             tree["let"] = lets
         header, inner, rounds_inside = self._header(phrases, rounds)

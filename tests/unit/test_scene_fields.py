@@ -46,7 +46,7 @@ def test_fields_are_set_in_shapes(tmp_path):
 
 
 def test_an_element_painted_later_is_fresh_and_a_place_keeps_its_value(tmp_path):
-    assert RULES.field("velocity").at == "place"
+    assert [field.at for field in RULES.fields if field.name == "velocity"] == ["place"]
     found = fields(
         tmp_path,
         "fill sand",
