@@ -10,7 +10,6 @@ from typing import Any
 from powderdsl.editing.json_schema import schema
 
 KEY = re.compile(r"""^(?P<indent>\s*(?:-\s+)*)(?P<key>"[^"]*"|[^\s#:"{\[-][^#:]*?):(?=\s|$)""")
-INDENT = re.compile(r"\s*(?:-\s+)*")
 
 
 @dataclass(frozen=True)
@@ -39,52 +38,33 @@ def cursor_at(text: str, offset: int) -> Cursor:
     end = text.find("\n", offset)
     line = text[begin : end if end >= 0 else len(text)]
     column = offset - begin
-    start = stop = column
-    while start > 0 and (line[start - 1].isalnum() or line[start - 1] == "_"):
-        start -= 1
-    while stop < len(line) and (line[stop].isalnum() or line[stop] == "_"):
-        stop += 1
+    start = column - len(re.split(r"\W", line[:column])[-1])
+    stop = column + len(re.split(r"\W", line[column:])[0])
     before = line[:start]
     path, key = _outer(text[:begin].split("\n")[:-1], line, before)
     path, key = _inner(before, path, key)
     return Cursor(path, key, line[start:stop], begin + start, begin + stop)
 
 
-def _width(line: str) -> int:
-    """The column of a line's content; `- ` belongs to the indentation."""
-    match = INDENT.match(line)
-    return match.end() if match else 0
-
-
 def _outer(above: list[str], line: str, before: str) -> tuple[tuple[str, ...], str | None]:
     """The path by indentation, and the key of the line if the cursor is behind it."""
     own = KEY.match(line)
-    inside = own is not None and len(before) > own.end("key")
-    limit = _width(line) if line.strip() else len(before)
-    path: list[str] = []
     is_item = line.lstrip().startswith("-")
-    if is_item:
-        limit = len(line) - len(line.lstrip()) + 1  # the key of a list may be in the column of its dashes
+    # The key of a list may be in the column of its dashes.
+    limit = len(line) - len(line.lstrip()) + is_item if line.strip() else len(before)
+    path: list[str] = []
     for other in reversed(above):
         match = KEY.match(other)
-        if (
-            not other.strip()
-            or other.lstrip().startswith("#")
-            or match is None
-            or match.end("indent") >= limit
-        ):
+        if match is None or match.end("indent") >= limit:
             continue
         path.append(match["key"].strip('"'))
         limit = match.end("indent")
         if limit == 0:
             break
-    key = own["key"].strip('"') if inside and own is not None else None
     path.reverse()
-    if key is None and path and before.strip() and not is_item and own is None:
-        return tuple(path[:-1]), path[-1]  # a continued value
-    if key is None and is_item and own is None:
+    if own is None and (is_item or before.strip()):  # an item, or a continued value
         return tuple(path[:-1]), path[-1] if path else None
-    return tuple(path), key
+    return tuple(path), own["key"].strip('"') if own and len(before) > own.end("key") else None
 
 
 def _inner(before: str, path: tuple[str, ...], key: str | None) -> tuple[tuple[str, ...], str | None]:
