@@ -49,7 +49,8 @@ def _columns(node: Node, column: int) -> Iterator[tuple[int, int]]:
     """The lines that begin with a key, a dash or the rest of a value, and the column of each."""
     if isinstance(node, Scalar):
         if node.style != "block":
-            yield from ((line, column) for line in _lines_of(node))
+            last, _ = node.span.source.position(max(node.span.end - 1, node.span.start))
+            yield from ((line, column) for line in range(node.span.line, last + 1))
     elif node.span.text[:1] in ("{", "["):
         return
     elif isinstance(node, Mapping):
@@ -78,10 +79,6 @@ def _texts(node: Node, column: int, lines: list[str], outer: int = -1) -> Iterat
         yield from ((number + 1, column - min(own, default=column)) for number in range(first, end))
 
 
-def _lines_of(node: Scalar) -> range:
-    return range(node.span.line, node.span.source.position(max(node.span.end - 1, node.span.start))[0] + 1)
-
-
 def _indent(line: str) -> int:
     return len(line) - len(line.lstrip(" "))
 
@@ -89,7 +86,7 @@ def _indent(line: str) -> int:
 def _moved(line: str, shift: int) -> str:
     """A line moved right by some columns."""
     if not line.strip():
-        return line if shift == 0 else line[: max(0, len(line) + shift)] if shift < 0 else line
+        return line[: max(0, len(line) + shift)]
     return " " * max(0, _indent(line) + shift) + line.lstrip(" ")
 
 

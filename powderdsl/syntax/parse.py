@@ -15,7 +15,7 @@ from powderdsl.syntax.yaml_tree import Node, Scalar
 from powderdsl.system.writing import cache_folder
 
 if TYPE_CHECKING:
-    from lark import Lark, Token, Tree
+    from lark import Lark, Tree
     from lark.exceptions import UnexpectedInput
 
 MAX_LENGTH = 2000
@@ -157,18 +157,12 @@ def depth(tree: Tree) -> int:
     return count
 
 
-def _to_syntax(tree: Tree | Token, line: Span, fallback: Span) -> Syntax:
-    source, first = line.source, line.start
-    if isinstance(tree, str):  # a token
-        start = first + tree.start_pos if tree.start_pos is not None else fallback.start
-        stop = first + tree.end_pos if tree.end_pos is not None else fallback.end
-        return Syntax("token", (), str(tree), Span(source, start, stop))
-    meta = tree.meta
-    span = fallback if meta.empty else Span(source, first + meta.start_pos, first + meta.end_pos)
-    children = [_to_syntax(child, line, span) for child in tree.children]
-    text = " ".join(child.text for child in children if child.kind == "token")
-    nodes = tuple(child for child in children if child.kind != "token")
-    return Syntax(str(tree.data), nodes, text, span)
+def _to_syntax(tree: Tree, line: Span, fallback: Span) -> Syntax:
+    meta, first = tree.meta, line.start
+    span = fallback if meta.empty else Span(line.source, first + meta.start_pos, first + meta.end_pos)
+    nodes = [_to_syntax(child, line, span) for child in tree.children if not isinstance(child, str)]
+    text = " ".join(child for child in tree.children if isinstance(child, str))  # its tokens
+    return Syntax(str(tree.data), tuple(nodes), text, span)
 
 
 def _report_syntax_error(
@@ -188,8 +182,7 @@ def _report_syntax_error(
     assert isinstance(error, UnexpectedToken)
     token = error.token
     at_end = token.type == "$END"
-    is_lost = at_end or token.start_pos is None
-    place = len(text[: line.end].rstrip()) if is_lost else line.start + token.start_pos
+    place = len(text[: line.end].rstrip()) if at_end else line.start + (token.start_pos or 0)
     start = min(max(place, line.start), max(len(text) - 1, 0))
     stop = start + (1 if at_end else len(token))
     accepted, fixed = set(error.accepts or error.expected or ()), fixed_terminals(language)
