@@ -89,10 +89,11 @@ def parse_yaml(source: Source, reporter: Reporter) -> Node | None:
 @lru_cache(maxsize=4)
 def _parsed(source: Source) -> tuple[Node | None, tuple[Diagnostic, ...]]:
     """The tree of a file, and its diagnostics: editors ask for the outline after each check."""
-    reporter = Reporter()
-    with suppress(CompileError):  # more errors than the limit
-        return _parse(source, reporter), reporter.diagnostics
-    return None, reporter.diagnostics
+    reporter, tree = Reporter(), None
+    with suppress(CompileError, _Abort):  # also at more errors than the limit
+        tree = _parse(source, reporter)
+    # A broken tree gets no further messages.
+    return None if reporter.has_errors else tree, reporter.diagnostics
 
 
 def _parse(source: Source, reporter: Reporter) -> Node | None:
@@ -108,7 +109,6 @@ def _parse(source: Source, reporter: Reporter) -> Node | None:
         message = f"invalid YAML: the character U+{ord(text[at]):04X} is not allowed"
         reporter.error("PD103", message, Span(source, at, at + 1), "not allowed in a text file", helps=helps)
         return None
-    builder = _Builder(source, reporter)
     try:
         # PyYAML cannot decode what escapes in a tag may spell for libyaml.
         if _LIBYAML is None or _ESCAPED_TAG.search(text):
@@ -116,14 +116,10 @@ def _parse(source: Source, reporter: Reporter) -> Node | None:
         else:
             events = yaml.parse(text, Loader=_LIBYAML)
         # Events are counted before anything recursive runs: the C loader's composer can be crashed by depth.
-        root = builder.build(events)
+        return _Builder(source, reporter).build(events)
     except yaml.YAMLError as error:
         report_yaml(error, source, reporter)
         return None
-    except _Abort:
-        return None
-    # A broken tree gets no further messages.
-    return None if builder.failed else root
 
 
 class _Abort(Exception):
@@ -137,16 +133,12 @@ class _Builder:
         self.source = source
         self.reporter = reporter
         self.nodes = 0
-        self.failed = False
 
     def build(self, events) -> Node | None:  # type: ignore[no-untyped-def]
         root: Node | None = None
-        documents = 0
         for event in events:
-            if isinstance(event, yaml.DocumentStartEvent):
-                documents += 1
-                if documents > 1:
-                    self._forbid(event, "a second document", "keep one pack to a file")
+            if isinstance(event, yaml.DocumentStartEvent) and root is not None:
+                self._forbid(event, "a second document", "keep one pack to a file")
             elif isinstance(event, yaml.NodeEvent):
                 root = self._node(event, events, 0)
         return root
@@ -163,7 +155,6 @@ class _Builder:
         raise _Abort
 
     def _fail(self, code: str, message: str, span: Span, label: str, fix: str, *others: Label) -> None:
-        self.failed = True
         self.reporter.error(code, message, span, label, secondary=others, helps=[fix])
 
     def _node(self, event, events, depth: int) -> Node:  # type: ignore[no-untyped-def]
