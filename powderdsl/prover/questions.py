@@ -206,12 +206,9 @@ class Questions:
             kind, attr, *args = terms.terms[term]
             if kind == "select":
                 condition: Literal = attr  # type: ignore[assignment]
-                if self.holds(condition):
-                    result, why = self._resolve(args[0], resolved)  # type: ignore[arg-type]
-                    resolved[term] = result, why | {condition}
-                else:
-                    result, why = self._resolve(args[1], resolved)  # type: ignore[arg-type]
-                    resolved[term] = result, why | {condition ^ 1}
+                side = int(not self.holds(condition))
+                result, why = self._resolve(args[side], resolved)  # type: ignore[arg-type]
+                resolved[term] = result, why | {condition ^ side}
             elif kind in OPS and kind not in LEAVES:
                 parts = [self._resolve(arg, resolved) for arg in args]  # type: ignore[arg-type]
                 whole = terms.apply(str(kind), attr, [part for part, _ in parts])
