@@ -132,10 +132,8 @@ def _cells(text: str) -> int:
     return sum(0 if combining(char) else 2 if east_asian_width(char) in "WF" else 1 for char in text)
 
 
-def _snippet(label: Label, caret: str) -> tuple[str, str]:
+def _snippet(span: Span, words: str, caret: str) -> tuple[str, str]:
     """The source line and the line of carets below it; a long line is cut to a window around the span."""
-    span = label.span
-    assert span is not None
     line_number, column = span.source.position(span.start)
     raw = span.source.line(line_number)
     start = min(column - 1, len(raw))
@@ -151,24 +149,23 @@ def _snippet(label: Label, caret: str) -> tuple[str, str]:
     text = ("…" if left else "") + visible(raw[left:right]) + ("…" if right < len(raw) else "")
     before = _cells(visible(raw[left:start])) + (1 if left else 0)
     width = max(1, _cells(visible(raw[left : min(end, right)])) + (1 if left else 0) - before)
-    return text, (" " * before + caret * width + (f" {printable(label.text)}" if label.text else "")).rstrip()
+    return text, (" " * before + caret * width + (f" {printable(words)}" if words else "")).rstrip()
 
 
 def source_lines(labels: Sequence[Label]) -> tuple[list[str], int]:
     """The source lines of labels with carets (`^` for the first label), and the width of the line numbers."""
-    placed = [label for label in labels if label.span]
-    gutter = max((len(str(label.span.line)) for label in placed if label.span), default=1)
+    placed = [(label.span, label) for label in labels if label.span]
+    gutter = max((len(str(span.line)) for span, _ in placed), default=1)
     lines: list[str] = []
     name = None
-    for label in placed:
-        assert label.span is not None
-        if label.span.source.name != name:
+    for span, label in placed:
+        if span.source.name != name:
             arrow = "-->" if name is None else ":::"
-            name = label.span.source.name
-            lines.append(f"{' ' * gutter}{arrow} {printable(label.span.place)}")
+            name = span.source.name
+            lines.append(f"{' ' * gutter}{arrow} {printable(span.place)}")
             lines.append(f"{' ' * gutter} |")
-        text, carets = _snippet(label, "^" if label is labels[0] else "-")
-        lines += [f"{label.span.line:>{gutter}} | {text}".rstrip(), f"{' ' * gutter} | {carets}"]
+        text, carets = _snippet(span, label.text, "^" if label is labels[0] else "-")
+        lines += [f"{span.line:>{gutter}} | {text}".rstrip(), f"{' ' * gutter} | {carets}"]
     return lines, gutter
 
 

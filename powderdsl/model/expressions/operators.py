@@ -35,6 +35,7 @@ from powderdsl.model.types import (
     Kind,
     Offset,
     integer,
+    plus,
 )
 from powderdsl.syntax.parse import Syntax, parse_text
 
@@ -149,10 +150,7 @@ def number(value: float | Fraction) -> Expr:
 def look(value: Expr, offset: Offset, span: Span | None = None) -> Expr:
     """A value at a neighbor. Nested offsets add up; constants are the same everywhere."""
     if value.op == "look":
-        inner = value.value
-        assert isinstance(inner, tuple)
-        offset = (offset[0] + inner[0], offset[1] + inner[1])
-        value = value.args[0]
+        offset, value = plus(offset, value.value), value.args[0]
     if offset == (0, 0) or value.op in ("const", "param"):
         return value
     return Expr("look", value.kind, (value,), offset, span)

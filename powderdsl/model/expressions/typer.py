@@ -202,8 +202,7 @@ class Typer:
     def wrong(self, operand: Operand, wanted: str, span: Span, *helps: str) -> Poisoned:
         """Report an operand of the wrong kind; the exception to raise after it."""
         secondary: tuple[Label, ...] = ()
-        if isinstance(operand, Expr) and operand.op == "let" and operand.span not in (None, span):
-            assert operand.span is not None
+        if isinstance(operand, Expr) and operand.op == "let" and operand.span and operand.span != span:
             if (operand.span, wanted) in self._misused:
                 return Poisoned()  # a value of the wrong kind is one mistake, however often it is used
             self._misused.add((operand.span, wanted))

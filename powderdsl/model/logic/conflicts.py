@@ -346,9 +346,7 @@ def _example_text(facts: Facts, elements: dict[Offset, int]) -> str:
 
 def _claim_offsets(first: Rule, second: Rule) -> Iterator[Offset]:
     """The offsets from the first rule's cell to cells in which the second rule would claim a cell of the first."""
-    if isinstance(first, Assign) or isinstance(second, Assign):
-        assert isinstance(first, Assign)
-        assert isinstance(second, Assign)
+    if isinstance(first, Assign) and isinstance(second, Assign):
         if first.field == second.field and first.value != second.value:
             yield minus(first.offset, second.offset)
         return
