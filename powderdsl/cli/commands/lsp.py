@@ -222,13 +222,13 @@ def server(beside: str = "") -> Any:
         entries = (
             node.entries if isinstance(node, Mapping) else [e for item in items for e in item.entries[:1]]
         )
-        found = []
+        rows = []
         for key, value in entries:
             below = symbols(value, depth - 1)
             sort = lsp.SymbolKind.Namespace if below else lsp.SymbolKind.Field
             whole = between(key.span.to(value.span))
-            found.append(lsp.DocumentSymbol(key.text[:80], sort, whole, between(key.span), children=below))
-        return found
+            rows.append(lsp.DocumentSymbol(key.text[:80], sort, whole, between(key.span), children=below))
+        return rows
 
     @served.feature(lsp.TEXT_DOCUMENT_DOCUMENT_SYMBOL)
     def outline(params: lsp.DocumentSymbolParams) -> list[lsp.DocumentSymbol]:
