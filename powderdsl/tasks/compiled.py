@@ -319,7 +319,7 @@ class Stepper(Plan):
             return status
         if self.play.counted:
             episodes, meter = self.episodes, self.program.meter
-            places = episodes.regions, episodes.targets, self._params
+            places = episodes.regions, episodes.targets, self._params, episodes.masks.sizes
             meter.take_cells(episodes.world, *places, self._now, self.counts)
         if not library.pd_finish(play):
             return EMPTY

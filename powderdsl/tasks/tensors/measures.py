@@ -80,17 +80,17 @@ class Meter:
         regions: Mapping[str, Tensor],
         targets: Mapping[str, Tensor],
         params: Mapping[str, Any] | None,
-        masks: Masks | None = None,
+        masks: Masks,
     ) -> Tensor:
         """The numbers of all measures: float64 [B, n]. `params` are those that differ from the rules' own.
 
-        With `masks`, packed worlds are not unpacked for measures on bit planes.
+        Packed worlds are not unpacked for measures on bit planes.
         """
         values = torch.empty(len(world), len(self.measures), dtype=torch.float64, device=self.device)
         state, counts = world.state, None
-        if masks is not None and isinstance(state, PackedState) and (counts := self.counts(state.program)):
+        if isinstance(state, PackedState) and (counts := self.counts(state.program)):
             counts.take(state.program.library, state.handle, masks.words, masks.sizes, values)
-        self.take_cells(world, regions, targets, params, values, counts)
+        self.take_cells(world, regions, targets, params, masks.sizes, values, counts)
         return values
 
     def take_cells(
@@ -99,21 +99,18 @@ class Meter:
         regions: Mapping[str, Tensor],
         targets: Mapping[str, Tensor],
         params: Mapping[str, Any] | None,
+        sizes: Tensor,
         values: Tensor,
         counts: CellCounts | None,
     ) -> None:
-        """Write the numbers that `counts` does not compute into `values`, float64 [B, n]."""
+        """Write the numbers that `counts` does not compute into `values`, float64 [B, n]. `sizes`: those of `masks`."""
         left = [number for number in range(len(self.measures)) if not counts or number not in counts.numbers]
         cells = self._cells.of(world, regions, params) if self._cells is not None and left else {}
         for number in left:
             measure = self.measures[number]
-            if measure.target is None:
-                values[:, number] = self._reduced(measure, cells[number], regions)
-                continue
-            target = targets[measure.target]
-            size = (target != NOTHING).sum((1, 2)).double()
-            same = (world.state["element"] == target).sum((1, 2)).double()
-            values[:, number] = same / size.clamp(min=1)
+            target = measure.target
+            own = cells[number] if target is None else world.state["element"] == targets[target]
+            values[:, number] = self._total(measure, own, regions) / sizes[:, number]
 
     def masks(self, regions: Mapping[str, Tensor], targets: Mapping[str, Tensor]) -> Masks:
         """Return the masks of worlds, in the order of `_mask_numbers`."""
@@ -211,21 +208,16 @@ class Meter:
         region = self.measures[number].region
         return cells if region is None else cells & regions[region]
 
-    def _reduced(self, measure: Measure, cells: Tensor, regions: Mapping[str, Tensor]) -> Tensor:
-        """One number per world, float64 [B], from cells [B, H, W]."""
-        mask = None if measure.region is None else regions[measure.region]
-        if mask is not None:
+    def _total(self, measure: Measure, cells: Tensor, regions: Mapping[str, Tensor]) -> Tensor:
+        """The sum of cells, [B, H, W], of a measure: float64 [B]."""
+        if measure.region is not None:
+            mask = regions[measure.region]
             cells = cells & mask if cells.dtype == torch.bool else cells * mask
+        if measure.how == "highest":
+            height = self.size[0] - torch.arange(self.size[0], device=self.device)
+            return (cells.any(2) * height).amax(1).double()
         exact = torch.int32 if cells.dtype == torch.bool else torch.int64  # counts: half the time
-        total = cells.sum((1, 2), dtype=torch.float64 if cells.dtype.is_floating_point else exact).double()
-        match measure.how:
-            case "share" | "mean":
-                count = self.size[0] * self.size[1] if mask is None else mask.sum((1, 2))
-                return total / torch.as_tensor(count, device=self.device).clamp(min=1)
-            case "highest":
-                height = self.size[0] - torch.arange(self.size[0], device=self.device)
-                return (cells.any(2) * height).amax(1).double()
-        return total
+        return cells.sum((1, 2), dtype=torch.float64 if cells.dtype.is_floating_point else exact).double()
 
 
 def _lets(measures: Sequence[Measure]) -> list[str]:
