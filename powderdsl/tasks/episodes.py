@@ -13,17 +13,17 @@ from torch import Tensor
 
 from powderdsl.simulation.simulator import Simulator, World
 from powderdsl.simulation.simulator import compile as compile_rules
-from powderdsl.targets.cpp.program import NativeProgram, PackedState
+from powderdsl.targets.cpp.program import NativeProgram
 from powderdsl.tasks.file import task_under
 from powderdsl.tasks.goals import measures_in, scalars_of
 from powderdsl.tasks.laws import Laws
 from powderdsl.tasks.shipped import check_split, load_task
 from powderdsl.tasks.task import Task
-from powderdsl.tasks.tensors.actions import CLOCK, Hands, put_rows, put_worlds
+from powderdsl.tasks.tensors.actions import CLOCK, Hands, put_rows, put_worlds, take_worlds
 from powderdsl.tasks.tensors.generator import StartWorlds
 from powderdsl.tasks.tensors.measures import Masks, Meter, ScalarInputs, scalar_value
 
-__all__ = ["Episodes", "TaskProgram", "check_actions", "compile_task", "load_task"]
+__all__ = ["Episodes", "TaskProgram", "compile_task", "load_task"]
 
 ROWS = ("seed", "acted", "failed", "start", "before")
 """Tensors of `Episodes`, one row per episode."""
@@ -187,12 +187,7 @@ class TaskProgram:
 
     def select(self, episodes: Episodes, places: Tensor) -> Episodes:
         """The episodes of numbers `places`, int64 [n], which may repeat."""
-        world, masks, state = episodes.world, episodes.masks, episodes.world.state
-        if isinstance(state, PackedState):
-            state = state.select(places)
-        else:
-            state = {name: value[places] for name, value in state.items()}
-        clock = [getattr(world, name)[places] for name in CLOCK]
+        masks = episodes.masks
         if len(masks.sizes) == len(episodes):
             masks = Masks(masks.words[places], masks.sizes[places])
         maps = {name: getattr(episodes, name) for name in ("regions", "targets", "params")}
@@ -201,7 +196,7 @@ class TaskProgram:
             for kind, values in maps.items()
         }
         rows = {name: getattr(episodes, name)[places] for name in ROWS}
-        return Episodes(World(self.simulator, state, *clock), **chosen, masks=masks, **rows)
+        return Episodes(take_worlds(episodes.world, places), **chosen, masks=masks, **rows)
 
     # Saving
 
@@ -248,7 +243,7 @@ class TaskProgram:
         params: Params = None,
         seen: Seen = None,
     ) -> tuple[Episodes, Tensor, Tensor, Tensor]:
-        """Take one action in each episode, int64 [B, 5] as returned by `check_actions`, and run the steps after it.
+        """Take one action in each episode, int64 [B, 5] within bounds, and run the steps after it.
 
         Args:
             actions: None lets the worlds run without an agent. The action counts, but nothing is painted, placed or
@@ -302,11 +297,6 @@ class TaskProgram:
     def law_bytes(self, episodes: Episodes) -> Tensor:
         """Return the laws that observations of episodes show, uint8 [B, n]: see `Laws`."""
         return self.laws.of(episodes.params, len(episodes)).to(episodes.seed.device)
-
-    @property
-    def block_edges(self) -> tuple[Tensor, Tensor]:
-        """The rows, then the columns, of the blocks that actions change: first and last + 1, int64 [bins, 2]."""
-        return self.hands.blocks.edges
 
     def measured(self, episodes: Episodes, params: Params = None) -> Tensor:
         """The current values of `measures`: float64 [B, n]."""
@@ -403,16 +393,11 @@ def integer_tensor(name: str, values: Any) -> Tensor:
     return tensor.to(torch.int64)
 
 
-def check_actions(program: TaskProgram, actions: Any) -> Tensor:
-    """Convert a caller's actions to int64 [B, 5] on the program's device.
+def check_numbers(actions: Any, nvec: tuple[int, ...], names: tuple[str, ...]) -> Tensor:
+    """Convert a caller's numbers to int64 [B, k], in column i from 0 to ``nvec[i] − 1``.
 
     Raises TypeError if they are not integers, ValueError for a wrong shape, or a number out of range, with its index.
     """
-    return check_numbers(actions, program.action_nvec, ACTION).to(program.simulator.device)
-
-
-def check_numbers(actions: Any, nvec: tuple[int, ...], names: tuple[str, ...]) -> Tensor:
-    """Convert a caller's numbers to int64 [B, k], in column i from 0 to ``nvec[i] − 1``. Raises as `check_actions`."""
     tensor = integer_tensor("actions", actions)
     if tensor.ndim != 2 or tensor.shape[1] != len(nvec):
         raise ValueError(f"actions must have the shape [episodes, {len(nvec)}], found {list(tensor.shape)}")

@@ -103,7 +103,7 @@ class ExpertPlayer:
     def _fullest(self, cells: Tensor) -> tuple[Tensor, Tensor]:
         """The first bin, int64 [B] each, whose block has most of some cells, bool [B, H, W]."""
         sums = torch.nn.functional.pad(cells.long().cumsum(1).cumsum(2), (1, 0, 1, 0))
-        (top, bottom), (left, right) = (edges.T for edges in self.program.block_edges)
+        (top, bottom), (left, right) = (edges.T for edges in self.program.hands.blocks.edges)
         count = sums[:, bottom][:, :, right] - sums[:, top][:, :, right]
         count += sums[:, top][:, :, left] - sums[:, bottom][:, :, left]
         best = count.flatten(1).argmax(1)

@@ -10,7 +10,7 @@ import pytest
 from powderdsl.compiler import load
 from powderdsl.diagnostics import Reporter, Source
 from powderdsl.simulation.simulator import compile as compile_rules
-from powderdsl.tasks.episodes import TaskProgram, check_actions, compile_task
+from powderdsl.tasks.episodes import ACTION, TaskProgram, check_numbers, compile_task
 from powderdsl.tasks.file import read_task
 
 HEAD = "task: test\nrules: powderworld\nsize: [64, 64]\nfill: empty\n"
@@ -43,7 +43,7 @@ def test_blowing_sets_the_speed_in_a_block_of_ten(torch, program_of):
     assert program.action_nvec == (16, 16, 1, 3, 3)
     episodes = program.start(torch.arange(4))
     actions = torch.tensor([[3, 8, 0, 2, 1], [0, 15, 0, 0, 2], [15, 0, 0, 1, 1], [7, 7, 0, 1, 0]])
-    after, *_ = program.act(episodes, check_actions(program, actions))
+    after, *_ = program.act(episodes, actions)
     expected = np.zeros((4, 2, 64, 64), dtype=np.float32)
     for number, (x, y, _, vx, vy) in enumerate(actions.tolist()):
         row, column = 4 * y + 2, 4 * x + 2  # the middle of a bin of four cells
@@ -93,22 +93,23 @@ def test_an_element_fills_the_block_with_fresh_cells(torch, program_of):
 
 def test_invalid_actions_are_refused(torch, program_of):
     program = program_of("agent: {may: [wall, empty], actions: 9, bins: [4, 8]}\n")
-    assert program.action_nvec == (8, 4, 2, 3, 3)
+    nvec = program.action_nvec
+    assert nvec == (8, 4, 2, 3, 3)
     good = np.array([[7, 3, 1, 2, 2], [0, 0, 0, 0, 0]])
-    assert check_actions(program, good).dtype == torch.int64
+    assert check_numbers(good, nvec, ACTION).dtype == torch.int64
     for place, value, name in ((0, 8, "x"), (1, 4, "y"), (2, 2, "choice"), (3, 3, "vx"), (4, -1, "vy")):
         bad = good.copy()
         bad[1, place] = value
         with pytest.raises(
             ValueError, match=rf"actions\[1, {place}\] \({name}\) is {value}: it must be in 0\.\."
         ):
-            check_actions(program, bad)
+            check_numbers(bad, nvec, ACTION)
     for wrong in (good[0], good[:, :4], good[None]):
         with pytest.raises(ValueError, match="shape"):
-            check_actions(program, wrong)
+            check_numbers(wrong, nvec, ACTION)
     for wrong in (good * 1.0, np.full((2, 5), np.nan), good > 0, "left", [[1, 2, 3, 4, None]]):
         with pytest.raises(TypeError, match="actions"):
-            check_actions(program, wrong)
+            check_numbers(wrong, nvec, ACTION)
 
 
 # What counts

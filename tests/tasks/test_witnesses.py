@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 import powderdsl
 from powderdsl.syntax.sources import shipped
-from powderdsl.tasks.episodes import TaskProgram, check_actions
+from powderdsl.tasks.episodes import ACTION, TaskProgram, check_numbers
 from powderdsl.tasks.players import ExpertPlayer
 from powderdsl.tasks.shipped import load_task, shipped_tasks
 from tests.tasks.witnesses import WITNESSES, Act, Seen
@@ -72,7 +72,8 @@ def play(name: str, split: str) -> dict[str, Played]:
         actions = scripted(turn)
         actions += random.integers(program.action_nvec, size=(WORLDS, 5)).tolist()
         actions += [numbers(("nothing", 0, 0))] * WORLDS
-        episodes, reward, success, ended = program.act(episodes, check_actions(program, actions), reuse=True)
+        checked = check_numbers(actions, program.action_nvec, ACTION)
+        episodes, reward, success, ended = program.act(episodes, checked, reuse=True)
         returns += np.where(over, 0, reward.numpy())
         solved |= success.numpy() & ~over
         over |= ended.numpy()
