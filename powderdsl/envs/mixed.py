@@ -15,8 +15,8 @@ from torch import Tensor
 from powderdsl.envs.compiled import CompiledEnv, Steps, tensors_of
 from powderdsl.envs.tensor_env import Info, check_going
 from powderdsl.tasks.compiled import Results, ReusedArray, Stepper
-from powderdsl.tasks.episodes import TaskProgram, load_program
-from powderdsl.tasks.mixed import MixedEpisodes, joined
+from powderdsl.tasks.episodes import Episodes, TaskProgram, load_program
+from powderdsl.tasks.mixed import MixedEpisodes
 from powderdsl.tasks.task import Task
 
 Array = np.ndarray[Any, Any]
@@ -98,14 +98,13 @@ class MixedEnv(CompiledEnv):
     """
 
     takes_mixed = True
+    rows = ("base", "episode", "ended")
 
     def __init__(self, task: str | Path | Task | TaskProgram, num_envs: int = 1, **how: Any):
         super().__init__(task, num_envs, **how)
         self._envs: dict[int, CompiledEnv] = {}
         self._groups: dict[int, tuple[CompiledEnv, Array]] = {}
         """The environment of the episodes under each ruleset, and the numbers of these episodes, int64 [n]."""
-        self._order = np.arange(num_envs)
-        """The place of each episode in the groups, one after another."""
 
     def _env(self, number: int) -> CompiledEnv:
         """The environment of the episodes under a ruleset."""
@@ -150,27 +149,25 @@ class MixedEnv(CompiledEnv):
             env = self._env(number)
             self._groups[number] = env, members
             episodes = env.program.start(worlds[new]) if len(new) else None
-            returned = torch.zeros(len(members), dtype=torch.float64)
             if staying.any():
                 assert env.episodes is not None
                 count = int(staying.sum())
                 places = torch.from_numpy(np.flatnonzero(staying))
-                returned[:count] = env.returns[places]
                 repeated = torch.cat([places, places[:1].expand(len(new))])
                 whole, last = env.program.select(env.episodes, repeated), torch.arange(count, len(members))
                 episodes = whole if episodes is None else env.program.put(whole, last, episodes, reuse=True)
             assert episodes is not None
             known = {param.name for param in env.task.ruleset.params}
             params = {name: value[members] for name, value in self.params.items() if name in known}
-            env.adopt(episodes, returned, params)
-        self._regroup(dict(sorted(self._groups.items())))
+            env.adopt(episodes, self._returned.masked_fill(mask, 0)[members], params)
+        self.episodes = self._regroup(dict(sorted(self._groups.items())))
 
-    def _regroup(self, groups: dict[int, tuple[CompiledEnv, Array]]) -> None:
-        """Continue with these groups."""
+    def _regroup(self, groups: dict[int, tuple[CompiledEnv, Array]]) -> Episodes:
+        """Continue with these groups. Returns their episodes."""
         self._groups = groups
         members = np.concatenate([rows for _, rows in groups.values()])
-        self._order = np.argsort(members)
-        self.episodes = episodes = MixedEpisodes([*groups.values()])  # type: ignore[assignment]  # same attributes
+        episodes = MixedEpisodes([*groups.values()])
+        self._order = episodes.order.numpy()
         steppers = [env._ready() for env, _ in groups.values()]
         space, ready = self.observation.space, [stepper for stepper in steppers if stepper is not None]
         self._joint = None
@@ -178,6 +175,7 @@ class MixedEnv(CompiledEnv):
             self._joint = Joint(ready, members, space.shape, space.dtype)
         if self.observation.kind == "laws":
             self._laws = episodes.joined(TaskProgram.law_bytes).numpy()
+        return episodes  # type: ignore[return-value]  # same attributes
 
     # Stepping
 
@@ -207,6 +205,7 @@ class MixedEnv(CompiledEnv):
             active = ~waiting.numpy()
             reward = np.where(active, reward, 0)
             terminated, truncated, success = terminated & active, truncated & active, success & active
+        self._returned = self._returned + torch.from_numpy(reward)
         ended = terminated | truncated
         info: dict[str, Any] = {
             "success": success,
@@ -218,7 +217,7 @@ class MixedEnv(CompiledEnv):
         }
         self._ended = torch.from_numpy(ended)
         if mode is AutoresetMode.SAME_STEP:
-            last = {"world": self.episodes.seed.numpy()}
+            last = {"world": self.episodes.seed.numpy().copy()}
             last |= {name: info[name] for name in ("success", "episode_return", "episode_length")}
             info["final_info"] = last | {f"_{name}": ended for name in last}
             info["final_obs"] = observed[ended]
@@ -226,7 +225,7 @@ class MixedEnv(CompiledEnv):
             waiting, self._ended = self._ended, torch.zeros_like(self._ended)
         if mode is not AutoresetMode.DISABLED:
             self._next_episodes(waiting, observed)
-        info["world"], info["_world"] = self.episodes.seed.numpy(), np.ones(self.num_envs, bool)
+        info["world"], info["_world"] = self.episodes.seed.numpy().copy(), np.ones(self.num_envs, bool)
         if self.shows_mask:
             info["action_mask"] = self.action_masks().to(torch.int8).numpy()
             info["_action_mask"] = info["_world"]
@@ -247,6 +246,7 @@ class MixedEnv(CompiledEnv):
             return
         assert self._base is not None
         self._episode, rows = self._episode + mask, mask.nonzero()[:, 0]
+        self._returned = self._returned.masked_fill(mask, 0)
         worlds = torch.zeros_like(self._episode)
         worlds[rows] = self._choose(self._base[rows], self._episode[rows])
         self._restart(mask, worlds)
@@ -258,53 +258,28 @@ class MixedEnv(CompiledEnv):
                 shown = env.observation.of(env.episodes)
                 observed[members[places]] = shown[places].numpy()
 
-    @property
-    def returns(self) -> Tensor:
-        """The return so far of each current episode: float64 [B]."""
-        return joined(
-            [env.returns for env, _ in self._groups.values()], [rows for _, rows in self._groups.values()]
-        )
-
-    def progress(self) -> tuple[float, int]:
-        """The return and the length so far of the only episode."""
-        ((env, _),) = self._groups.values()
-        return env.progress()
-
     # Saving
 
-    def state(self) -> dict[str, Any]:
-        """Return everything that later steps depend on: see `TensorEnv.state`."""
-        if self.episodes is None or self._base is None:
-            raise ResetNeeded("reset the environment before saving it")
+    def _saved(self, episodes: Episodes) -> dict[str, Any]:
         return {
-            **{name: getattr(self, f"_{name}").clone() for name in ("base", "episode", "ended")},
-            "params": {name: value.clone() for name, value in self.params.items()},
             "groups": {
                 number: {"rows": torch.from_numpy(rows), "env": env.state()}
                 for number, (env, rows) in self._groups.items()
             },
         }
 
-    def restore(self, state: Mapping[str, Any]) -> Tensor:
-        """Continue from a result of `state`: see `TensorEnv.restore`."""
-        if len(state["base"]) != self.num_envs:
-            raise ValueError(f"{len(state['base'])} worlds were saved: {self.num_envs} are needed")
+    def _loaded(self, state: Mapping[str, Any]) -> Episodes:
         groups: dict[int, tuple[CompiledEnv, Array]] = {}
         for number, saved in state["groups"].items():
             rows = saved["rows"].numpy().copy()
             if not 0 <= number < len(self.program.rulesets):
                 raise ValueError(f"no ruleset {number}: there are {len(self.program.rulesets)}")
-            env = CompiledEnv(self.program.under(number), len(rows))
+            env = self._env(number)
+            env.num_envs = len(rows)
             env.restore(saved["env"])
-            assert env.episodes is not None
-            groups[number] = self._env(number), rows
-            self._env(number).adopt(env.episodes, env.returns, env.params)
+            groups[number] = env, rows
         members = np.concatenate([rows for _, rows in groups.values()])
         if sorted(members.tolist()) != [*range(self.num_envs)]:
             raise ValueError("the saved worlds are not those of an environment")
-        for name in ("base", "episode", "ended"):
-            setattr(self, f"_{name}", state[name].clone())
-        self.params = {name: value.clone() for name, value in state["params"].items()}
-        self._regroup(groups)
-        assert self.episodes is not None
-        return self.observation.of(self.episodes)
+        self._returned[members] = torch.cat([env.returns for env, _ in groups.values()])
+        return self._regroup(groups)

@@ -95,9 +95,6 @@ Info = dict[str, Any]
 """Tensors [B] by name; if a key concerns only some of the worlds, ``_key``, bool [B], marks them."""
 
 OPTIONS = ("params", "worlds", "reset_mask")
-ROWS = ("base", "episode", "returned", "ended")
-"""Attributes (without `_`) that `TensorEnv.state` saves: one number per environment."""
-
 MAX_SEED = (1 << 62) - 1
 """The largest seed and world number."""
 
@@ -155,6 +152,8 @@ class TensorEnv:
     """
 
     takes_mixed = False
+    rows: tuple[str, ...] = ("base", "episode", "returned", "ended")
+    """Attributes (without `_`) that `state` saves: one number per environment."""
 
     def __init__(
         self,
@@ -337,13 +336,16 @@ class TensorEnv:
         Raises:
             ResetNeeded: before the first reset.
         """
-        if self.episodes is None or self._base is None:
+        if self.episodes is None:
             raise ResetNeeded("reset the environment before saving it")
         return {
-            **{name: getattr(self, f"_{name}").to("cpu", copy=True) for name in ROWS},
+            **{name: getattr(self, f"_{name}").to("cpu", copy=True) for name in self.rows},
             "params": {name: value.to("cpu", copy=True) for name, value in self.params.items()},
-            "episodes": self.program.saved(self.episodes),
+            **self._saved(self.episodes),
         }
+
+    def _saved(self, episodes: Episodes) -> dict[str, Any]:
+        return {"episodes": self.program.saved(episodes)}
 
     def restore(self, state: Mapping[str, Any]) -> Tensor:
         """Continue from a result of `state`, also in another process or on another backend or device.
@@ -357,13 +359,16 @@ class TensorEnv:
         """
         if len(state["base"]) != self.num_envs:
             raise ValueError(f"{len(state['base'])} worlds were saved: {self.num_envs} are needed")
-        episodes = self.program.loaded(state["episodes"])
-        rows = {name: state[name].to(self.device, copy=True) for name in ROWS}
+        rows = {name: state[name].to(self.device, copy=True) for name in self.rows}
         params = {name: value.to(self.device, copy=True) for name, value in state["params"].items()}
+        episodes = self._loaded(state)
         self.episodes, self.params = episodes, params
         for name, value in rows.items():
             setattr(self, f"_{name}", value)
         return self.observation.of(episodes)
+
+    def _loaded(self, state: Mapping[str, Any]) -> Episodes:
+        return self.program.loaded(state["episodes"])
 
     # Stepping
 

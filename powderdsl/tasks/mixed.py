@@ -25,17 +25,17 @@ class Playing(Protocol):
 class MixedWorld:
     """Worlds of several simulators, in the order of their environments, for drawing."""
 
-    def __init__(self, parts: Sequence[World], rows: Sequence[Array]):
-        self._parts, self._rows = parts, rows
+    def __init__(self, parts: Sequence[World], order: Tensor):
+        self._parts, self._order = parts, order
 
     @property
     def ids(self) -> Tensor:
         """The elements, uint8 [B, H, W]."""
-        return joined([part.ids for part in self._parts], self._rows)
+        return torch.cat([part.ids for part in self._parts])[self._order]
 
     def rgb(self) -> Tensor:
         """Pictures, uint8 [B, H, W, 3], each in the colors of its rules."""
-        return joined([part.rgb() for part in self._parts], self._rows)
+        return torch.cat([part.rgb() for part in self._parts])[self._order]
 
 
 class MixedEpisodes:
@@ -47,26 +47,25 @@ class MixedEpisodes:
 
     def __init__(self, groups: Sequence[tuple[Playing, Array]]):
         self._envs = [env for env, _ in groups]
-        self._rows = [rows for _, rows in groups]
+        self.order = torch.from_numpy(np.argsort(np.concatenate([rows for _, rows in groups])))
+        """The place of each episode in the groups, one after another: int64 [B]."""
+        self.seed = self.joined(lambda program, episodes: episodes.seed)
+        """The numbers of their start worlds, int64 [B]."""
 
     def __len__(self) -> int:
-        return sum(map(len, self._rows))
+        return len(self.order)
 
-    def __getattr__(self, name: str) -> Tensor:
-        if name not in ("seed", "acted", "failed"):
-            raise AttributeError(name)
-        return self.joined(lambda program, episodes: getattr(episodes, name))
+    @property
+    def acted(self) -> Tensor:
+        """The numbers of actions so far, int64 [B]."""
+        return self.joined(lambda program, episodes: episodes.acted)
 
     @property
     def world(self) -> MixedWorld:
         """The worlds."""
-        return MixedWorld([env.episodes.world for env in self._envs if env.episodes], self._rows)
+        return MixedWorld([env.episodes.world for env in self._envs if env.episodes], self.order)
 
     def joined(self, read: Callable[[TaskProgram, Episodes], Tensor]) -> Tensor:
         """Apply a function to the episodes of each program, and join the results: [B, …]."""
-        return joined([read(env.program, env.episodes) for env in self._envs if env.episodes], self._rows)
-
-
-def joined(parts: Sequence[Tensor], rows: Sequence[Array]) -> Tensor:
-    """The rows of tensors, each at its number in `rows`: [B, …]."""
-    return torch.cat([*parts])[torch.from_numpy(np.argsort(np.concatenate([*rows])))]
+        parts = [read(env.program, env.episodes) for env in self._envs if env.episodes]
+        return torch.cat(parts)[self.order]
