@@ -1,8 +1,13 @@
-"""Environments whose whole step, from actions to observations, is one call of native code."""
+"""Environments whose whole step, from actions to observations, is one call of native code.
+
+`Stepper` lays out the call's inputs and outputs. Tensors of the episodes are written in place.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import ctypes
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -10,18 +15,242 @@ import torch
 from gymnasium.vector import AutoresetMode
 from torch import Tensor
 
-from powderdsl.envs.tensor_env import (
-    Info,
-    TensorEnv,
-    check_going,
-    reset_mask,
-    world_seeds,
-)
-from powderdsl.targets.cpp.program import Places
-from powderdsl.tasks.compiled import EMPTY, Results, Stepper
+from powderdsl.envs.tensor_env import Info, TensorEnv, check_going, reset_mask, world_seeds
+from powderdsl.simulation.simulator import World
+from powderdsl.targets.cpp.episodes import MODES, Play
+from powderdsl.targets.cpp.program import NativeProgram, PackedState, Places
+from powderdsl.tasks.compiled import Arguments, Results, operations
+from powderdsl.tasks.episodes import Episodes, params_of
+from powderdsl.tasks.goals import ACTION_WORDS
+from powderdsl.tasks.tensors.measures import Masks
+
+POOL_CELLS = 1 << 22
+"""Approximate number of cells of start worlds made ahead: many small worlds, or few large ones."""
+
+MOST_AHEAD, FEW_CELLS = 64, 1 << 16
+"""Maximum number of start worlds made ahead per episode; more for few cells, where batch overhead dominates."""
+
+READY, EMPTY = -1, -2
+"""Results of `pd_play`: done, or start worlds must be made before `pd_begin`."""
 
 Steps = tuple[Any, Any, Any, Any, dict[str, Any]]
 """Observations, reward, terminated, truncated and infos: arrays."""
+
+
+class Plan(Arguments):
+    """The part of a step that does not depend on the worlds: `play` without their arrays.
+
+    Args:
+        env: the environment.
+        places: the state's layout in the code of its rules.
+    """
+
+    def __init__(self, env: TensorEnv, places: Places):
+        super().__init__(places)
+        self.program = program = env.program
+        agent, goal, hands, form = env.task.agent, env.task.goal, program.hands, env.action_form
+        kind = "ids" if env.observation.kind == "laws" else env.observation.kind
+        self.views = views = env.simulator.observer.views(kind, places, env.task.size[0] * env.task.size[1])
+        space = env.observation.space
+        assert space.dtype is not None
+        self.counts = program.meter.counts(places)
+        counted = 0 if self.counts is None else len(self.counts.numbers)
+        self.measures_cells = counted < len(program.measures)
+        """True if some measures are computed from tensors, between two parts of a step."""
+        self.play = play = Play(
+            threads=1,
+            steps=agent.steps_per_action,
+            free_steps=agent.free_steps,
+            actions=agent.actions,
+            limit=env.max_episode_steps,
+            mode=MODES.index(env.autoreset_mode.name),
+            last_terminates=env.last_action_terminates,
+            counts_always=program.counts_always,
+            numbers=len(form.nvec),
+            speed=agent.speed,
+            measures=len(program.measures),
+            views=len(views.parts),
+            view=ctypes.addressof(views.array),
+            size=int(np.prod(space.shape)) * space.dtype.itemsize,
+            counts=0 if self.counts is None else ctypes.addressof(self.counts.plan),
+            counts_painted=hands.counts,
+        )
+        play.most = self.address("most", np.array(form.nvec, np.int64))
+        if form.kind == "discrete":
+            play.table = self.address("table", form.table)
+        else:
+            play.column = self.address("column", form.columns)
+        play.choices = self.address("choices", np.array(agent.choices, np.int64))
+        self.set_blocks(play, hands.blocks, np.array(agent.choices).clip(0))
+        speeds = [] if agent.speed_field is None else places.pieces[agent.speed_field]
+        play.speed_row, play.speed_column = [places.homes[piece.name][0] for piece in speeds] or (-1, -1)
+        for name in ("each", "final", "success", "failure"):
+            steps = operations(getattr(goal, name), program.measure_numbers)
+            getattr(play, name).count, getattr(play, name).ops = len(steps), self.address(name, steps)
+
+
+class Stepper(Plan):
+    """Steps a batch of episodes of an environment in native code."""
+
+    def __init__(self, env: TensorEnv, native: NativeProgram):
+        super().__init__(env, native)
+        self.native, self.play.threads = native, native.threads
+        self.filled: Tensor | None = None
+        """int64 [B]: the first episode of each row whose start world has not been made."""
+        self._ahead: Episodes | None = None
+        self._play = ctypes.byref(self.play)
+        self._has_maps = False
+
+    def bind(self, episodes: Episodes, params: Mapping[str, Tensor], kept: Mapping[str, Tensor]) -> Episodes:
+        """Return the episodes in memory that later steps write to.
+
+        `params` are float64 [B] each, as `TaskProgram.act` takes them; `kept` are an environment's tensors by the names of `Play`, [B] each: ``episode``,
+        ``returned``, and ``waiting``, the episodes that are over.
+        """
+        world, worlds = episodes.world, len(episodes)
+        state = self.native.pack(world.state)
+        # Copies: `start` and `before`, and numbers of worlds, may be the same tensors.
+        clock = [tensor.clone() for tensor in (world.seed, world.index, world.step)]
+        names = ("seed", "acted", "failed", "start", "before")
+        rows = {name: getattr(episodes, name).clone(memory_format=torch.contiguous_format) for name in names}
+        masks = Masks(episodes.masks.words.clone(), episodes.masks.sizes.clone())
+        own = {name: cells.clone() for name, cells in self._own(episodes.regions).items()}
+        self.episodes = replace(
+            episodes,
+            world=World(self.program.simulator, state, *clock),
+            regions={**episodes.regions, **own},
+            targets={name: target.clone() for name, target in episodes.targets.items()},
+            params={name: value.clone() for name, value in episodes.params.items()},
+            masks=masks,
+            **rows,
+        )
+        self._has_maps = bool(own or episodes.targets or episodes.params)
+        self._overrides = params
+        self._params = self.program.simulator.parameters(params_of(episodes, params) or {}, worlds)
+        self._inputs = inputs = self.native.inputs(self._params, worlds)
+        if self.filled is None or len(self.filled) != worlds:
+            self.filled, self._ahead = torch.zeros(worlds, dtype=torch.int64), None
+        self._now = torch.zeros_like(rows["before"])
+        self.begins = torch.zeros(worlds, dtype=torch.bool)
+        clocks = zip(("seed", "index", "step"), clock, strict=True)
+        rows["world"] = rows.pop("seed")
+        self.read_from(np.empty((worlds, self.play.numbers), np.int64))
+        self._results: Results | None = None
+        self._tensors: dict[str, Tensor] = {
+            **dict(clocks),
+            **rows,
+            **kept,
+            "param_planes": inputs.planes,
+            "param_reals": inputs.reals,
+            "now": self._now,
+            "masks": masks.words,
+            "sizes": masks.sizes,
+            "action": torch.zeros(worlds, len(ACTION_WORDS), dtype=torch.int64),
+            "begins": self.begins,
+            "filled": self.filled,
+        }
+        for name, tensor in self._tensors.items():
+            setattr(self.play, name, tensor.data_ptr())
+        self.play.mask_words, self.play.own_masks = masks.words[0].numel(), self.program.meter.own
+        return self.episodes
+
+    def write_to(self, results: Results) -> None:
+        """Let the next calls write to results."""
+        if results is not self._results:
+            for name, address in results.addresses.items():
+                setattr(self.play, name, address)
+            self._results = results
+
+    def read_from(self, numbers: Any) -> None:
+        """Let the next calls read actions from an array, int64 [B, k]."""
+        self.numbers, self._numbers_at = numbers, numbers.ctypes.data
+
+    def step(self) -> int:
+        """Step with `numbers`. Returns READY or EMPTY, or the index of the first number out of range (nothing has
+        changed then).
+        """
+        library, play, address = self.native.library, self._play, self._numbers_at
+        self._state().forget()
+        if not self.measures_cells:
+            status: int = library.pd_play(play, address)
+            if status == READY and self._has_maps:
+                self._copy_maps()
+            return status
+        status = library.pd_act(play, address)
+        if status >= 0:
+            return status
+        if self.play.counted:
+            episodes, meter = self.episodes, self.program.meter
+            places = episodes.regions, episodes.targets, self._params, episodes.masks.sizes
+            meter.take_cells(episodes.world, *places, self._now, self.counts)
+        if not library.pd_finish(play):
+            return EMPTY
+        self.begin()
+        return READY
+
+    def begin(self) -> None:
+        """Begin the next episodes where `begins` is set, and write observations."""
+        self._state().forget()
+        self.native.library.pd_begin(self._play)
+        self._copy_maps()
+
+    def _state(self) -> PackedState:
+        """Return the worlds that the library writes to. Raises RuntimeError if they were stepped with `reuse`."""
+        state: PackedState = self.episodes.world.state  # type: ignore[assignment]
+        self.play.batch = state.handle
+        return state
+
+    def _own(self, regions: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        """Return the regions that differ between worlds."""
+        return {name: cells for name, cells in regions.items() if name not in self.program.fixed}
+
+    def _copy_maps(self) -> None:
+        """Copy the regions, targets and parameters of episodes that have begun."""
+        if not self._has_maps or self._ahead is None or not bool(self.begins.any()):
+            return
+        own = self._own(self.episodes.regions)
+        rows = self.begins.nonzero()[:, 0]
+        places = rows * self.play.depth + self._tensors["episode"][rows] % self.play.depth
+        for name, cells in own.items():
+            cells[rows] = self._ahead.regions[name][places]
+        for name, target in self.episodes.targets.items():
+            target[rows] = self._ahead.targets[name][places]
+        if self.episodes.params:
+            for name, drawn in self.episodes.params.items():
+                drawn[rows] = self._ahead.params[name][places]
+            for name, value in (params_of(self.episodes, self._overrides) or {}).items():
+                self._params[name].copy_(value)
+            own_params = {name: value[rows] for name, value in self._params.items()}
+            bits, floats = self.native.layout.parameters(torch, own_params, len(rows))
+            self._inputs.planes[:, rows], self._inputs.reals[:, rows] = bits, floats
+
+    def fill(self, numbers: Callable[[Tensor, Tensor], Tensor]) -> None:
+        """Make the start worlds of the next episodes if one that begins lacks its own.
+
+        `numbers` maps rows and episodes to worlds, int64 [n] each.
+        """
+        worlds = len(self.begins)
+        cells = worlds * self.program.task.size[0] * self.program.task.size[1]
+        depth = self.play.depth = min(-(-POOL_CELLS // cells), max(MOST_AHEAD, FEW_CELLS // cells))
+        assert self.filled is not None
+        episode = self._tensors["episode"]
+        if not bool((self.begins & (episode + 1 >= self.filled)).any()):
+            return
+        first, end = torch.maximum(self.filled, episode + 1), episode + 1 + depth
+        count = end - first
+        rows = torch.arange(worlds).repeat_interleave(count)
+        episodes = torch.arange(len(rows)) - (count.cumsum(0) - count - first)[rows]
+        places = rows * depth + episodes % depth
+        order = places.argsort()
+        ahead = self.program.start(numbers(rows[order], episodes[order]), self.native)
+        if self._ahead is not None:
+            ahead = self.program.put(self._ahead, places[order], ahead, reuse=True)
+        self._ahead = ahead
+        state: PackedState = ahead.world.state  # type: ignore[assignment]
+        self.filled.copy_(end)
+        self.play.pool, self.play.pool_world = state.handle, ahead.seed.data_ptr()
+        self.play.pool_start, self.play.pool_sizes = ahead.start.data_ptr(), ahead.masks.sizes.data_ptr()
+        self.play.pool_masks = ahead.masks.words.data_ptr()
 
 
 class CompiledEnv(TensorEnv):
@@ -46,7 +275,7 @@ class CompiledEnv(TensorEnv):
         if native is None or self.episodes is None:
             return None
         if self._stepper is None or self._stepper.native is not native:
-            self._stepper = Stepper(self.program, native, *plan_arguments(self, native))
+            self._stepper = Stepper(self, native)
         self._results = ()
         kept = {"episode": self._episode, "returned": self._returned, "waiting": self._ended}
         self.episodes = self._stepper.bind(self.episodes, self.params, kept)
@@ -161,23 +390,6 @@ class CompiledEnv(TensorEnv):
                 raise ValueError(f"{len(checked)} actions for {self.num_envs} environments")
             given = np.asarray(actions)
         places[...] = given
-
-
-def plan_arguments(env: TensorEnv, places: Places) -> tuple[Any, ...]:
-    """Return the arguments of `Plan` after the first two, for the step of an environment."""
-    form, space, size = env.action_form, env.observation.space, env.task.size
-    assert space.dtype is not None
-    kind = "ids" if env.observation.kind == "laws" else env.observation.kind
-    return (
-        env.simulator.observer.views(kind, places, size[0] * size[1]),
-        int(np.prod(space.shape)) * space.dtype.itemsize,
-        env.autoreset_mode.name,
-        env.max_episode_steps,
-        env.last_action_terminates,
-        form.nvec,
-        None if form.kind == "discrete" else form.columns,
-        form.table,
-    )
 
 
 def arrays_of(info: Info) -> dict[str, Any]:

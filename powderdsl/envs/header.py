@@ -10,13 +10,12 @@ import numpy as np
 import torch
 
 from powderdsl.compiler import segments_of
-from powderdsl.envs.compiled import plan_arguments
+from powderdsl.envs.compiled import Plan
 from powderdsl.envs.tensor_env import TensorEnv
 from powderdsl.system.writing import failure
 from powderdsl.targets.cpp.program import Places
 from powderdsl.targets.cpp.source import known_width, native_source
 from powderdsl.targets.layout import braced, pieces
-from powderdsl.tasks.compiled import Plan
 from powderdsl.tasks.episodes import Episodes
 
 SETTINGS = (
@@ -55,7 +54,7 @@ def c_environment(env: TensorEnv, worlds: int, name: str) -> CEnvironment:
         )
     code = native_source(segments[0].planes, known_width(size[1]))
     places = Places(code.layout, pieces(segments[0].program))
-    plan = Plan(env.program, places, *plan_arguments(env, places))
+    plan = Plan(env, places)
     if plan.measures_cells:
         helps = ("`powderdsl show TASK --cost` names them",)
         raise failure("PD702", "bit planes do not show all measures of this task", helps=helps)

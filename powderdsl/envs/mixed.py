@@ -12,9 +12,9 @@ from gymnasium.error import ResetNeeded
 from gymnasium.vector import AutoresetMode
 from torch import Tensor
 
-from powderdsl.envs.compiled import CompiledEnv, Steps, tensors_of
+from powderdsl.envs.compiled import CompiledEnv, Stepper, Steps, tensors_of
 from powderdsl.envs.tensor_env import Info, check_going
-from powderdsl.tasks.compiled import Results, ReusedArray, Stepper
+from powderdsl.tasks.compiled import Results, ReusedArray
 from powderdsl.tasks.episodes import Episodes, TaskProgram, load_program
 from powderdsl.tasks.mixed import MixedEpisodes
 from powderdsl.tasks.task import Task
