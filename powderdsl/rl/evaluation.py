@@ -117,12 +117,18 @@ def play(
             policy's random numbers; by default 0, 1, ….
         recorder: receives all worlds and actions.
     """
-    if program.is_mixed:
-        return _play_mixed(program, policy, worlds, observation, numbers, seed)
+    numbers = torch.arange(len(worlds)) if numbers is None else numbers
+    if program.is_mixed:  # one ruleset after another
+        how: dict[str, Any] = {"observation": observation, "seed": seed}
+        rulesets = [*program.apart(worlds)]
+        parts = [play(own, policy, worlds[at], numbers=numbers[at], **how) for at, own in rulesets]
+        order = torch.cat([at for at, _ in rulesets]).argsort()
+        return Played(*(torch.cat(part)[order] for part in zip(*parts, strict=True)))
+    if isinstance(policy, ExpertPlayer):
+        policy = policy.under(program.ruleset or 0)
     sight = observation_of(observation, program)
     episodes = program.start(worlds)
     device = episodes.seed.device
-    numbers = torch.arange(len(worlds)) if numbers is None else numbers
     numbers = numbers.to(device)
     returns = torch.zeros(len(worlds), dtype=torch.float64, device=device)
     lengths, going = torch.zeros_like(episodes.seed), torch.ones_like(episodes.failed)
@@ -151,26 +157,6 @@ def play(
         if not bool(going.any()):
             break
     return Played(returns.cpu(), lengths.cpu(), succeeded.cpu())
-
-
-def _play_mixed(
-    program: TaskProgram,
-    policy: Policy | ExpertPlayer | None,
-    worlds: Tensor,
-    observation: str,
-    numbers: Tensor | None,
-    seed: int,
-) -> Played:
-    """`play` for worlds under different rulesets, one ruleset after another."""
-    numbers = torch.arange(len(worlds)) if numbers is None else numbers
-    parts, places = [], []
-    for chosen, own in program.apart(worlds):
-        player = policy.under(own.ruleset or 0) if isinstance(policy, ExpertPlayer) else policy
-        how: dict[str, Any] = {"numbers": numbers[chosen], "seed": seed}
-        parts.append(play(own, player, worlds[chosen], observation=observation, **how))
-        places.append(chosen)
-    order = torch.cat(places).argsort()
-    return Played(*(torch.cat(part)[order] for part in zip(*parts, strict=True)))
 
 
 def evaluate(
@@ -377,14 +363,10 @@ def film(
         return played, recorder.pictures()
     parts, films = [], []
     for number, ruleset in enumerate(program.ruleset_of(worlds).tolist()):
-        own, player = (
-            program.under(ruleset),
-            policy.under(ruleset) if isinstance(policy, ExpertPlayer) else policy,
-        )
-        place = slice(number, number + 1)
+        own, place = program.under(ruleset), torch.tensor([number])
         recorder = Film(own.task, 1, factor)
         how: dict[str, Any] = {"observation": observation, "seed": seed, "recorder": recorder}
-        parts.append(play(own, player, worlds[place], numbers=torch.arange(len(worlds))[place], **how))
+        parts.append(play(own, policy, worlds[place], numbers=place, **how))
         films.append(list(recorder.pictures()))
     longest = max(map(len, films))
     scenes = zip(*([*film, *[film[-1]] * (longest - len(film))] for film in films), strict=True)
