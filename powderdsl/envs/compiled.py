@@ -180,9 +180,9 @@ class Stepper(Plan):
         if status >= 0:
             return status
         if self.play.counted:
-            episodes, meter = self.episodes, self.program.meter
-            places = episodes.regions, episodes.targets, self._params, episodes.masks.sizes
-            meter.take_cells(episodes.world, *places, self._now, self.counts)
+            episodes = self.episodes
+            places = episodes.regions, episodes.targets, self._params, episodes.masks
+            self.program.meter.take(episodes.world, *places, self._now)
         if not library.pd_finish(play):
             return EMPTY
         self.begin()

@@ -81,36 +81,25 @@ class Meter:
         targets: Mapping[str, Tensor],
         params: Mapping[str, Any] | None,
         masks: Masks,
+        known: Tensor | None = None,
     ) -> Tensor:
         """The numbers of all measures: float64 [B, n]. `params` are those that differ from the rules' own.
 
-        Packed worlds are not unpacked for measures on bit planes.
+        Packed worlds are not unpacked for measures on bit planes. `known`: numbers to complete, which has these.
         """
-        values = torch.empty(len(world), len(self.measures), dtype=torch.float64, device=self.device)
-        state, counts = world.state, None
-        if isinstance(state, PackedState) and (counts := self.counts(state.program)):
+        values, state, counts = known, world.state, None
+        if values is None:
+            values = torch.empty(len(world), len(self.measures), dtype=torch.float64, device=self.device)
+        if isinstance(state, PackedState) and (counts := self.counts(state.program)) and known is None:
             counts.take(state.program.library, state.handle, masks.words, masks.sizes, values)
-        self.take_cells(world, regions, targets, params, masks.sizes, values, counts)
-        return values
-
-    def take_cells(
-        self,
-        world: World,
-        regions: Mapping[str, Tensor],
-        targets: Mapping[str, Tensor],
-        params: Mapping[str, Any] | None,
-        sizes: Tensor,
-        values: Tensor,
-        counts: CellCounts | None,
-    ) -> None:
-        """Write the numbers that `counts` does not compute into `values`, float64 [B, n]. `sizes`: those of `masks`."""
         left = [number for number in range(len(self.measures)) if not counts or number not in counts.numbers]
         cells = self._cells.of(world, regions, params) if self._cells is not None and left else {}
         for number in left:
             measure = self.measures[number]
             target = measure.target
             own = cells[number] if target is None else world.state["element"] == targets[target]
-            values[:, number] = self._total(measure, own, regions) / sizes[:, number]
+            values[:, number] = self._total(measure, own, regions) / masks.sizes[:, number]
+        return values
 
     def masks(self, regions: Mapping[str, Tensor], targets: Mapping[str, Tensor]) -> Masks:
         """Return the masks of worlds, in the order of `_mask_numbers`."""
