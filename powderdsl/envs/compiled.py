@@ -385,9 +385,7 @@ class CompiledEnv(TensorEnv):
         """Write actions into `places`, int64 [B, k] or [B]. Raises TypeError and ValueError as `TensorEnv.step`."""
         given = actions.numpy() if isinstance(actions, Tensor) else actions
         if not isinstance(given, np.ndarray) or given.shape != places.shape or given.dtype.kind not in "iu":
-            checked = self.action_form.decode(actions)
-            if len(checked) != self.num_envs:
-                raise ValueError(f"{len(checked)} actions for {self.num_envs} environments")
+            self._checked(actions)
             given = np.asarray(actions)
         places[...] = given
 

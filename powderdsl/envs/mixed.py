@@ -8,12 +8,11 @@ from typing import Any
 
 import numpy as np
 import torch
-from gymnasium.error import ResetNeeded
 from gymnasium.vector import AutoresetMode
 from torch import Tensor
 
 from powderdsl.envs.compiled import CompiledEnv, Stepper, Steps, tensors_of
-from powderdsl.envs.tensor_env import Info, check_going
+from powderdsl.envs.tensor_env import Info
 from powderdsl.tasks.compiled import Results, ReusedArray
 from powderdsl.tasks.episodes import Episodes, TaskProgram, load_program
 from powderdsl.tasks.mixed import MixedEpisodes
@@ -187,14 +186,9 @@ class MixedEnv(CompiledEnv):
 
     def step_arrays(self, actions: Any) -> Steps:
         """Act once in every episode: `step` with NumPy arrays."""
-        if self.episodes is None:
-            raise ResetNeeded("reset the environment before its first step")
-        checked = self.action_form.decode(actions)
-        if len(checked) != self.num_envs:
-            raise ValueError(f"{len(checked)} actions for {self.num_envs} environments")
+        self._checked(actions)
+        assert self.episodes is not None
         numbers, mode = np.asarray(actions), self.autoreset_mode
-        if mode is AutoresetMode.DISABLED:
-            check_going(self._ended)
         step = self._step_apart if self._joint is None else self._joint.step
         observed, reward, terminated, truncated, success, returned, length = step(numbers)
         if self.observation.kind == "laws":

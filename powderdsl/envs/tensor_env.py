@@ -391,15 +391,8 @@ class TensorEnv:
             TypeError: actions are not integers. Nothing has changed then.
             ValueError: actions have a wrong shape or are out of range. Nothing has changed then.
         """
-        if self.episodes is None:
-            raise ResetNeeded("reset the environment before its first step")
-        checked = self.action_form.decode(actions)
-        if checked.shape[0] != self.num_envs:
-            raise ValueError(f"{len(checked)} actions for {self.num_envs} environments")
-        waiting = self._ended
-        if self.autoreset_mode is AutoresetMode.DISABLED:
-            check_going(waiting)
-        params = self.params or None
+        checked, waiting, params = self._checked(actions), self._ended, self.params or None
+        assert self.episodes is not None
         after, reward, success, _ = self.program.act(self.episodes, checked, reuse=True, params=params)
         self.episodes = after
         failed, last = after.failed, after.acted >= self.task.agent.actions
@@ -423,6 +416,17 @@ class TensorEnv:
             self._begin(waiting, observed)
         self._add_shown(info, torch.ones_like(ended))
         return observed, reward, terminated, truncated, info
+
+    def _checked(self, actions: Any) -> Tensor:
+        """The five numbers of the actions of a step, int64 [B, 5]. Raises as `step`."""
+        if self.episodes is None:
+            raise ResetNeeded("reset the environment before its first step")
+        checked = self.action_form.decode(actions)
+        if len(checked) != self.num_envs:
+            raise ValueError(f"{len(checked)} actions for {self.num_envs} environments")
+        if self.autoreset_mode is AutoresetMode.DISABLED:
+            check_going(self._ended)
+        return checked
 
     def _begin(self, mask: Tensor, observed: Tensor, info: Info | None = None) -> None:
         """Begin the next episodes where `mask`, bool [B], is set, and write their first observations to `observed`.
