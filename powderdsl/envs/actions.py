@@ -160,15 +160,13 @@ class FrameStack:
         self.frames = frames
         self._kept: Tensor | None = None
 
-    def push(self, observed: Tensor, fresh: Tensor | None = None) -> Tensor:
-        """The stack [B, frames · C, …] after observations [B, C, …]; `fresh`, bool [B], marks new episodes."""
+    def push(self, observed: Tensor) -> Tensor:
+        """The stack [B, frames · C, …] after observations [B, C, …]."""
         if self.frames == 1:
             return observed
         channels = observed.shape[1]
         if self._kept is None:
             self._kept = observed.new_zeros(len(observed), self.frames * channels, *observed.shape[2:])
-        elif fresh is not None:
-            self._kept[fresh] = 0
         self._kept = torch.cat([self._kept[:, channels:], observed], 1)
         return self._kept
 
