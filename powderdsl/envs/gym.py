@@ -82,6 +82,10 @@ class Face:
         limit = self.tensors.max_episode_steps
         self._spec = None if value is None else replace(value, max_episode_steps=limit)
 
+    def action_masks(self) -> Array:
+        """Return the mask of allowed actions: bool [B, n], the values of an action's first number, then of its second, …"""
+        return array(self.tensors.action_masks())
+
     def frames(self, mode: str) -> tuple[Any, ...]:
         """A picture of each world, uint8 [H·factor, W·factor, 3], or its rows as text."""
         if self.tensors.episodes is None:
@@ -154,10 +158,6 @@ class PowderVectorEnv(Face, VectorEnv[Any, Any, Any]):
             infos["final_obs"] = objects(infos["final_obs"], infos["_final_obs"])
         observed, reward, terminated, truncated = parts
         return observed, reward, terminated, truncated, infos
-
-    def action_masks(self) -> Array:
-        """Return the mask of allowed actions: bool [B, n], the values of an action's first number, then of its second, …"""
-        return array(self.tensors.action_masks())
 
     def render(self) -> tuple[Any, ...] | None:
         """Draw each world: uint8 [H·scale, W·scale, 3], or text; None without `render_mode`."""

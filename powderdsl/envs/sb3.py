@@ -70,10 +70,6 @@ class PowderVecEnv(Face, VecEnv):
                     infos[place]["is_success"] = bool(final["success"][place])
         return observed, reward, done, infos
 
-    def action_masks(self) -> Array:
-        """Return the mask of allowed actions, for `MaskablePPO`: bool [B, n]."""
-        return array(self.tensors.action_masks())
-
     def state(self) -> dict[str, Any]:
         """The result of `TensorEnv.state`."""
         return self.tensors.state()
