@@ -259,13 +259,6 @@ class TrainedPolicy:
         return distribution.action(indices[0]) if joint else torch.stack(indices, 1)
 
 
-class _NoOptimizer:
-    """No optimizer, for networks that only act: the first one of a process imports torch's compiler for a second."""
-
-    def __init__(self, *_: object, **__: object):
-        pass
-
-
 def load_policy(run: RunFolder | str | Path, env: TensorEnv, *, deterministic: bool = False) -> TrainedPolicy:
     """Load the policy of a run's newest checkpoint, for the observations and actions of `env`, on its device.
 
@@ -293,7 +286,9 @@ def load_policy(run: RunFolder | str | Path, env: TensorEnv, *, deterministic: b
         low, high = (bound.repeat(config.frames, 0) for bound in (space.low, space.high))
         space = Box(low, high, dtype=space.dtype.type)
     actions, rate = MultiDiscrete(np.array(own.action_nvec)), config.learning_rate
-    network = kind(space, actions, lambda _: rate, **how | {"optimizer_class": _NoOptimizer})
+    # Networks that only act need no optimizer: the first one of a process imports torch's compiler for a second.
+    how["optimizer_class"] = lambda *_, **__: None
+    network = kind(space, actions, lambda _: rate, **how)
     with reporting_misfits(folder.path, "its network has another shape"):
         network.load_state_dict(checkpoint.state["policy"])
     network.to(env.device).set_training_mode(False)
