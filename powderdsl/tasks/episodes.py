@@ -34,9 +34,6 @@ Seen = Callable[[World], None] | None
 ACTION = ("x", "y", "choice", "vx", "vy")
 """The numbers of an action."""
 
-DONE = ("painted", "placed", "blown")
-"""Numbers that `Hands.act` returns for rewards."""
-
 
 @dataclass(frozen=True)
 class Episodes:
@@ -262,7 +259,7 @@ class TaskProgram:
         if actions is not None:
             world, done = self.hands.act(world, actions, reuse=reuse)
         else:
-            done = dict.fromkeys(DONE, torch.zeros_like(episodes.acted))
+            done = dict.fromkeys(("painted", "placed", "blown"), torch.zeros_like(episodes.acted))
         if seen is not None:
             seen(world)
         world = self._run(world, agent.steps_per_action, params, reuse, seen)

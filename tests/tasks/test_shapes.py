@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from powderdsl.targets.tensor_kind import Tensors
-from powderdsl.tasks.tensors.generator import shape_cells
+from powderdsl.tasks.tensors.generator import cells_between, shape_rows
 from powderdsl.worlds.raster import Shape, mask, root
 
 PLACE = st.integers(-12, 90)
@@ -83,7 +83,8 @@ def test_batches_cover_the_same_cells(torch, kind):
         opens = [batch[0][i] is None for i in range(len(batch[0]))]
         batch = [one for one in batch if [n is None for n in one] == opens]
         columns = [None if n[0] is None else torch.tensor(n) for n in zip(*batch, strict=True)]
-        found = shape_cells(Tensors(), kind, columns, size).numpy()
+        rows = shape_rows(Tensors(), kind, columns, size)
+        found = cells_between(Tensors(), *rows, size).numpy()
         for one, numbers in zip(found, batch, strict=True):
             expected = definition(kind, numbers, size)
             assert np.array_equal(one, expected), (numbers, size)

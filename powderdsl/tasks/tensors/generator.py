@@ -23,18 +23,13 @@ from powderdsl.worlds.raster import Shape, Size, covered_rows, mask
 from powderdsl.worlds.scene.statements import constants
 
 
-def shape_cells(kind: ArrayKind, shape: str, numbers: Sequence[Array | None], size: Size) -> Array:
-    """The cells of shapes, not frames: bool [..., H, W].
-
-    `numbers` are int64 [...], in the order of `scene.statements.NUMBERS`; None is an open end.
-    """
-    return cells_between(kind, *shape_rows(kind, shape, numbers, size), size)
-
-
 def shape_rows(
     kind: ArrayKind, shape: str, numbers: Sequence[Array | None], size: Size
 ) -> tuple[Array, Array]:
-    """The first row that shapes cover in each column, and how many: [..., W], of the type of `_row_type`."""
+    """The first row that shapes, not frames, cover in each column, and how many: [..., W], of the type of `_row_type`.
+
+    `numbers` are int64 [...], in the order of `scene.statements.NUMBERS`; None is an open end.
+    """
     columns = [None if number is None else number[..., None] for number in numbers]
     edges = covered_rows(kind.xp, shape, columns, kind.arange(size[1]), size)
     first, last = (
@@ -232,7 +227,8 @@ class WorldMaker:
             if constants(shape.amounts) is not None:
                 region_cells = region_cells | self.fixed(shape)
             else:
-                cells = shape_cells(self.kind, shape.kind, draws.arrays, self.size)
+                rows = shape_rows(self.kind, shape.kind, draws.arrays, self.size)
+                cells = cells_between(self.kind, *rows, self.size)
                 region_cells = region_cells | cells.reshape(-1, *self.size)
         return region_cells
 
