@@ -458,9 +458,6 @@ class _MetricsWriter(KVWriter):
     def write(self, key_values: dict[str, Any], key_excluded: dict[str, Any], step: int = 0) -> None:
         self.metrics.write(step, _numbers(key_values))
 
-    def close(self) -> None:
-        """Do nothing: the run closes its metrics."""
-
 
 def _numbers(values: Mapping[str, Any]) -> dict[str, float]:
     """The values that are numbers: Python's or NumPy's."""
