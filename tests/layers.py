@@ -165,7 +165,6 @@ _TORCH = (
     "targets.torch.packed",
     "targets.torch.library",
     "targets.torch.fuse",
-    "targets.arrays.program",
     "targets.cpp.program",
     "targets.cuda.program",
     "targets.cpp.counts",

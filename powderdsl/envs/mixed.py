@@ -263,17 +263,16 @@ class MixedEnv(CompiledEnv):
         }
 
     def _loaded(self, state: Mapping[str, Any]) -> Episodes:
-        groups: dict[int, tuple[CompiledEnv, Array]] = {}
-        for number, saved in state["groups"].items():
-            rows = saved["rows"].numpy().copy()
+        rows = {number: saved["rows"].numpy().copy() for number, saved in state["groups"].items()}
+        for number in rows:
             if not 0 <= number < len(self.program.rulesets):
                 raise ValueError(f"no ruleset {number}: there are {len(self.program.rulesets)}")
-            env = self._env(number)
-            env.num_envs = len(rows)
-            env.restore(saved["env"])
-            groups[number] = env, rows
-        members = np.concatenate([rows for _, rows in groups.values()])
+        members = np.concatenate([*rows.values()])
         if sorted(members.tolist()) != [*range(self.num_envs)]:
             raise ValueError("the saved worlds are not those of an environment")
+        groups = {number: (self._env(number), own) for number, own in rows.items()}
+        for number, (env, own) in groups.items():
+            env.num_envs = len(own)
+            env.restore(state["groups"][number]["env"])
         self._returned[members] = torch.cat([env.returns for env, _ in groups.values()])
         return self._regroup(groups)

@@ -184,7 +184,7 @@ class TensorEnv:
         check_cells(num_envs, self.task.size)
         if self.program.is_mixed and not self.takes_mixed:
             message = f"the worlds of {self.task.name}, {self.split}, run under different rulesets"
-            raise ValueError(f"{message}: use powderdsl.envs.environment")
+            raise ValueError(f"{message}: use powderdsl.envs.mixed.environment")
         self.num_envs, self.worlds = num_envs, worlds
         self.simulator = self.program.simulator
         self.device = self.simulator.device

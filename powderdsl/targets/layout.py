@@ -24,7 +24,7 @@ def pieces(program: Program) -> dict[str, tuple[SlotType, ...]]:
 
 
 def limits(xp: Any, values: Any, threshold: Threshold) -> Any:
-    """The number of possible draws below each chance (float64 [B]), or not above it if strict: int64 [B]."""
+    """The number of possible draws below each chance (float64 [B]), or not above it if not strict: int64 [B]."""
     count = 1 << threshold.bits
     scaled = values * count - 0.5
     limit = -xp.floor(-scaled) if threshold.strict else xp.floor(scaled) + 1

@@ -22,8 +22,8 @@ from powderdsl.diagnostics.diagnostic import diagnostic_data, render_text
 from powderdsl.editing.layout import formatted
 from powderdsl.editing.workspace import Rules, completions, explanation
 from powderdsl.model.definitions import set_params
-from powderdsl.model.state import qualified_slots, slot_name
-from powderdsl.model.types import Ruleset
+from powderdsl.model.state import qualified_slots
+from powderdsl.model.types import ELEMENT, Ruleset
 from powderdsl.simulation.standalone import standalone_module
 from powderdsl.syntax.sources import shipped
 from powderdsl.system.cache import Memo
@@ -287,15 +287,15 @@ class Session:
             if name not in ours:
                 raise BadRequest(f"the rules have no element {name}")
             table[int(number)] = ours[name]
-        octets = base64.b64decode(data["ids"]).translate(bytes(table))
-        ids = np.frombuffer(octets, np.uint8).reshape((1, *shape))
+        ids = np.frombuffer(base64.b64decode(data["ids"]).translate(table), np.uint8).reshape((1, *shape))
         fields: dict[str, Any] = {}
-        names = qualified_slots(rules).values()
-        for name, field in data["fields"].items():
-            if name in names:
-                values = np.frombuffer(base64.b64decode(field["values"]), np.dtype(field["type"]))
+        for own, name in qualified_slots(rules).items():
+            slot, field = sim.slot_by_name.get(own), data["fields"].get(name)
+            if slot and field:
+                octets = base64.b64decode(field["values"])
+                octets = octets.translate(table) if slot.kind == ELEMENT else octets
                 components = (2,) if field["components"] == 2 else ()
-                fields[slot_name(rules, name)] = values.reshape((1, *components, *shape))
+                fields[slot.name] = np.frombuffer(octets, field["type"]).reshape((1, *components, *shape))
         seed, index, step = (int(number) for number in data["clock"])
         world = sim.replace(sim.world(ids, seed=seed), **fields)
         return replace(world, index=np.full_like(world.index, index), since=step)

@@ -303,7 +303,7 @@ def test_rules_that_a_task_does_not_fit_are_refused(mixed: Path) -> None:
 def test_plain_environments_refuse_several_rulesets(mixed: Path) -> None:
     from powderdsl.envs.tensor_env import TensorEnv
 
-    with pytest.raises(ValueError, match=r"different rulesets: use powderdsl\.envs\.environment"):
+    with pytest.raises(ValueError, match=r"different rulesets: use powderdsl\.envs\.mixed\.environment"):
         TensorEnv(mixed / "mixed.yaml")
 
 

@@ -163,6 +163,30 @@ def test_worlds_are_saved_and_opened(session: bridge.Session, tmp_path: Path) ->
     assert "error" in call("open_world", base64.b64encode(b"no world").decode())
 
 
+def test_worlds_of_other_ids_are_translated(session: bridge.Session, tmp_path: Path) -> None:
+    """After an edit, the page's world may have other ids than the rules, also in fields that contain elements."""
+    call("check", files("powderworld"), [])
+    ruleset = powderdsl.load("powderworld")
+    sim = powderdsl.compile(ruleset)
+    number = {element.name: element.id for element in ruleset.elements}
+    kinds = np.random.default_rng(1).integers(0, 14, (1, 16, 64)).astype(np.uint8)
+    world = sim.replace(
+        sim.world(kinds), clone=np.where(kinds == number["cloner"], number["water"], 0).astype(np.uint8)
+    )
+    state = {name: value[0].numpy() for name, value in world.state.items()}
+    swapped = np.arange(256, dtype=np.uint8)
+    swapped[[number["water"], number["sand"]]] = number["sand"], number["water"]
+    data = world_data(
+        ruleset, swapped[state.pop("element")], state | {"clone": swapped[state["clone"]]}, (0, 0, 0)
+    )
+    data["palette"] = {str(swapped[int(id)]): name for id, name in data["palette"].items()}
+    path = tmp_path / "world.npz"
+    path.write_bytes(call("save", data))
+    loaded = load_world(path, sim)
+    for name, values in world.state.items():
+        assert (values == loaded.state[name]).all(), name
+
+
 def test_reports(session: bridge.Session) -> None:
     call("check", files("core", "sand"), [])
     assert call("ledger")["result"].startswith("ledger of core+sand")

@@ -309,7 +309,7 @@ def _within(value: Value, low: float, high: float) -> Value:
 
 
 def _limit(value: Value, threshold: Threshold) -> Value:
-    """The number of draws below a chance, or not above it, as in `codec.limits`."""
+    """The number of draws below a chance, or not above it, as in `targets.layout.limits`."""
     count = 1 << threshold.bits
     scaled = op("f64.sub", value * count, 0.5)
     return _within(op("f64.ceil", scaled) if threshold.strict else op("f64.floor", scaled) + 1, 0, count)
