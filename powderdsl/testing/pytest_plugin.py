@@ -63,9 +63,9 @@ def home_of(path: Path) -> str:
 
 
 def _members(text: str) -> list[str]:
-    """The packs of a ruleset that are listed on one line."""
-    match = re.search(r"^packs:[ \t]*\[?([^\]\n]*)", text, re.MULTILINE)
-    return re.findall(r"\w+", match[1]) if match else []
+    """The packs that a ruleset lists."""
+    match = re.search(r"^packs:(.*?)(?=^\w|\Z)", text, re.MULTILINE | re.DOTALL)
+    return re.findall(r"\w+", re.sub(r"#.*", "", match[1])) if match else []
 
 
 @cache

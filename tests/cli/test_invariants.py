@@ -105,3 +105,17 @@ def test_packs_under_pytest(folder):
     assert "3 failed, 4 passed" in done.stdout
     assert "yard.yaml::weed grows to the left PASSED" in done.stdout
     assert "yard.yaml:16: broken at row" in done.stdout
+
+
+@pytest.mark.parametrize(
+    "packs",
+    ["packs: [core, yard]", "packs: [core,\n  yard]", "packs:\n- core  # first\n- yard", "packs:\n  - yard"],
+)
+def test_a_pack_is_tested_in_the_ruleset_that_lists_it(tmp_path, packs):
+    from powderdsl.testing.pytest_plugin import home_of
+
+    (tmp_path / "yard.yaml").write_text(PACK)
+    assert home_of(tmp_path / "yard.yaml") == str(tmp_path / "yard.yaml")
+    (tmp_path / "field.yaml").write_text(f"ruleset: field\n{packs}\nabout: no shed\n")
+    assert home_of(tmp_path / "yard.yaml") == str(tmp_path / "field.yaml")
+    assert home_of(tmp_path / "shed.yaml") == str(tmp_path / "shed.yaml")
