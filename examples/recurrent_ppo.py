@@ -1,7 +1,7 @@
 """Recurrent PPO of sb3-contrib: an agent with a memory, in universes that training never shows.
 
     pip install 'powderdsl[sb3-contrib]'
-    python examples/recurrent_ppo.py --task find-the-solvent --rulesets 64 --seeds 3
+    python examples/recurrent_ppo.py --task find-the-solvent --rulesets 64 --seeds 5
 
 The settings are those of `powderdsl train --preset small --epochs 4`, with an LSTM between the features and the policy, so
 its returns can be compared with those of the study `unseen-laws`. It prints the mean return of each run on its training
