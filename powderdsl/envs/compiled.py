@@ -126,7 +126,8 @@ class Stepper(Plan):
         )
         self._has_maps = bool(own or episodes.targets or episodes.params)
         self._overrides = params
-        self._params = self.program.simulator.parameters(params_of(episodes, params) or {}, worlds)
+        chosen, simulator = params_of(episodes, params), self.program.simulator
+        self._params = simulator.parameters(chosen, worlds) if chosen else simulator.defaults(worlds)
         self._inputs = inputs = self.native.inputs(self._params, worlds)
         if self.filled is None or len(self.filled) != worlds:
             self.filled, self._ahead = torch.zeros(worlds, dtype=torch.int64), None

@@ -11,7 +11,7 @@ import torch
 from gymnasium.vector import AutoresetMode
 from torch import Tensor
 
-from powderdsl.envs.compiled import CompiledEnv, Stepper, Steps, tensors_of
+from powderdsl.envs.compiled import POOL_CELLS, CompiledEnv, Stepper, Steps, tensors_of
 from powderdsl.envs.tensor_env import Info
 from powderdsl.tasks.compiled import Results, ReusedArray
 from powderdsl.tasks.episodes import Episodes, TaskProgram, load_program
@@ -19,6 +19,9 @@ from powderdsl.tasks.mixed import MixedEpisodes
 from powderdsl.tasks.task import Task
 
 Array = np.ndarray[Any, Any]
+
+MOST_AHEAD = 16
+"""Maximum number of episodes of an environment whose start worlds are made ahead."""
 
 
 def environment(task: str | Path | Task | TaskProgram, num_envs: int = 1, **how: Any) -> CompiledEnv:
@@ -104,6 +107,11 @@ class MixedEnv(CompiledEnv):
         self._envs: dict[int, CompiledEnv] = {}
         self._groups: dict[int, tuple[CompiledEnv, Array]] = {}
         """The environment of the episodes under each ruleset, and the numbers of these episodes, int64 [n]."""
+        self._depth = min(MOST_AHEAD, POOL_CELLS // (num_envs * self.task.size[0] * self.task.size[1]))
+        self._ahead: dict[int, tuple[dict[int, int], Episodes]] = {}
+        """By ruleset: start worlds made ahead, and the place of each world's number in them."""
+        self._ahead_from: tuple[Tensor, Tensor] | None = None
+        """The seeds of the environments, and the first episodes whose worlds were made ahead: int64 [B]."""
 
     def _env(self, number: int) -> CompiledEnv:
         """The environment of the episodes under a ruleset."""
@@ -147,7 +155,7 @@ class MixedEnv(CompiledEnv):
                 continue
             env = self._env(number)
             self._groups[number] = env, members
-            episodes = env.program.start(worlds[new]) if len(new) else None
+            episodes = self._start(number, worlds[new]) if len(new) else None
             if staying.any():
                 assert env.episodes is not None
                 count = int(staying.sum())
@@ -160,6 +168,30 @@ class MixedEnv(CompiledEnv):
             params = {name: value[members] for name, value in self.params.items() if name in known}
             env.adopt(episodes, self._returned.masked_fill(mask, 0)[members], params)
         self.episodes = self._regroup(dict(sorted(self._groups.items())))
+
+    def _start(self, number: int, worlds: Tensor) -> Episodes:
+        """Return the start of episodes under a ruleset: worlds that were made ahead, or new ones."""
+        program, (places, ahead) = self._env(number).program, self._ahead.get(number, ({}, None))
+        rows = [places.get(world, -1) for world in worlds.tolist()]
+        return (
+            program.start(worlds)
+            if ahead is None or -1 in rows
+            else program.select(ahead, torch.tensor(rows))
+        )
+
+    def _make_ahead(self, base: Tensor, first: Tensor) -> None:
+        """Make start worlds under the rulesets in use, from the episodes `first`, int64 [B], on.
+
+        A batch of many worlds takes little longer than one of a few.
+        """
+        episodes = first + torch.arange(self._depth)[:, None]
+        worlds = self._choose(base.expand_as(episodes).flatten(), episodes.flatten()).unique()
+        rulesets, self._ahead, self._ahead_from = self.program.ruleset_of(worlds), {}, (base, first)
+        for number, env in self._envs.items():
+            own = worlds[rulesets == number]
+            if len(own):
+                places = {world: place for place, world in enumerate(own.tolist())}
+                self._ahead[number] = places, env.program.start(own)
 
     def _regroup(self, groups: dict[int, tuple[CompiledEnv, Array]]) -> Episodes:
         """Continue with these groups. Returns their episodes."""
@@ -241,6 +273,11 @@ class MixedEnv(CompiledEnv):
         assert self._base is not None
         self._episode, rows = self._episode + mask, mask.nonzero()[:, 0]
         self._returned = self._returned.masked_fill(mask, 0)
+        if self.curriculum is None and self._depth > 1:
+            base, first = self._ahead_from or (None, self._episode)
+            places = (self._episode - first)[rows]
+            if base is not self._base or not bool(((places >= 0) & (places < self._depth)).all()):
+                self._make_ahead(self._base, self._episode + ~mask)
         worlds = torch.zeros_like(self._episode)
         worlds[rows] = self._choose(self._base[rows], self._episode[rows])
         self._restart(mask, worlds)

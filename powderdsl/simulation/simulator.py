@@ -243,7 +243,7 @@ class Simulator:
         self.device = self.kind.device
         self.slot_by_name: dict[str, Slot] = {slot.name: slot for slot in slots(ruleset)}
         self._options: dict[str, Any] = {"threads": threads, "tensors": tensors, "memo": memo}
-        self._defaults = lru_cache(BATCH_SIZES)(self._default_parameters)
+        self.defaults = lru_cache(BATCH_SIZES)(self._default_parameters)
         """Default parameters by batch size. Programs cache the inputs of these mappings, which must not change."""
         self._program = make_program(ruleset, backend, self.kind, threads, memo)
 
@@ -489,7 +489,7 @@ class Simulator:
         """
         self.check(world)
         steps, batch = _step_count(steps, world), world.seed.shape[0]
-        values = self._defaults(batch) if params is None else self._parameters(params, batch)
+        values = self.defaults(batch) if params is None else self._parameters(params, batch)
         draws = self._draws(random, world) if random is not None else {}
         names = self._pass_names(passes) if passes is not None else None
         clock = Clock(world.seed, world.index, world.start, world.since)
@@ -549,7 +549,7 @@ class Simulator:
 
     def _parameters(self, params: Mapping[str, Any], batch: int) -> Mapping[str, Array]:
         """Like `parameters`, but defaults share memory. Raises KeyError, TypeError, ValueError."""
-        values, by_name = self._defaults(batch), {param.name: param for param in self.ruleset.params}
+        values, by_name = self.defaults(batch), {param.name: param for param in self.ruleset.params}
         for name, value in check_mapping("params", params).items():
             if name not in by_name:
                 raise unknown_name("parameter", name, by_name)
@@ -562,7 +562,7 @@ class Simulator:
         Native code reports processor time of one thread. Raises TypeError and ValueError as `step` does.
         """
         self.check(world)
-        timing, params = PassClock(self.device), self._defaults(len(world))
+        timing, params = PassClock(self.device), self.defaults(len(world))
         clock = Clock(world.seed, world.index, world.start, world.since)
         self._program.run(Job(world.state, clock, _step_count(steps, world), params, {}, None, timing=timing))
         return {name: timing.seconds[name] for name in self.passes} if timing.seconds else {}

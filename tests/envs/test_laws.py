@@ -174,7 +174,9 @@ def alone(folder: Path, worlds: int, backend: str, **how: Any) -> list[list[Any]
 
 @pytest.mark.parametrize("backend", ["wasm", "native"])
 @pytest.mark.parametrize("mode", MODES)
-def test_worlds_under_different_rules_do_what_they_do_alone(mixed: Path, backend: str, mode: str) -> None:
+def test_worlds_under_different_rules_do_what_they_do_alone(
+    mixed: Path, backend: str, mode: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     import torch
 
     from powderdsl.envs.mixed import environment
@@ -183,6 +185,9 @@ def test_worlds_under_different_rules_do_what_they_do_alone(mixed: Path, backend
     if backend == "native":
         skip_without_compiler()
     count, pool = 7, 40
+    monkeypatch.setattr(
+        "powderdsl.envs.mixed.MOST_AHEAD", 2
+    )  # so that start worlds are made ahead more than once
     how: dict[str, Any] = {"autoreset_mode": mode, "backend": backend, "worlds": pool}
     env = environment(mixed / "mixed.yaml", count, **how)
     players = alone(mixed, count, backend)
