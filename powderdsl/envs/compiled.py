@@ -33,6 +33,13 @@ MOST_AHEAD, FEW_CELLS = 64, 1 << 16
 READY, EMPTY = -1, -2
 """Results of `pd_play`: done, or start worlds must be made before `pd_begin`."""
 
+
+def episodes_ahead(worlds: int, size: tuple[int, int]) -> int:
+    """The number of episodes of each environment for which start worlds are made at once."""
+    cells = worlds * size[0] * size[1]
+    return min(-(-POOL_CELLS // cells), max(MOST_AHEAD, FEW_CELLS // cells))
+
+
 Steps = tuple[Any, Any, Any, Any, dict[str, Any]]
 """Observations, reward, terminated, truncated and infos: arrays."""
 
@@ -231,8 +238,7 @@ class Stepper(Plan):
         `numbers` maps rows and episodes to worlds, int64 [n] each.
         """
         worlds = len(self.begins)
-        cells = worlds * self.program.task.size[0] * self.program.task.size[1]
-        depth = self.play.depth = min(-(-POOL_CELLS // cells), max(MOST_AHEAD, FEW_CELLS // cells))
+        depth = self.play.depth = episodes_ahead(worlds, self.program.task.size)
         assert self.filled is not None
         episode = self._tensors["episode"]
         if not bool((self.begins & (episode + 1 >= self.filled)).any()):

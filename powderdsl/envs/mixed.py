@@ -11,7 +11,7 @@ import torch
 from gymnasium.vector import AutoresetMode
 from torch import Tensor
 
-from powderdsl.envs.compiled import POOL_CELLS, CompiledEnv, Stepper, Steps, tensors_of
+from powderdsl.envs.compiled import CompiledEnv, Stepper, Steps, episodes_ahead, tensors_of
 from powderdsl.envs.tensor_env import Info
 from powderdsl.tasks.compiled import Results, ReusedArray
 from powderdsl.tasks.episodes import Episodes, TaskProgram, load_program
@@ -19,9 +19,6 @@ from powderdsl.tasks.mixed import MixedEpisodes
 from powderdsl.tasks.task import Task
 
 Array = np.ndarray[Any, Any]
-
-MOST_AHEAD = 16
-"""Maximum number of episodes of an environment whose start worlds are made ahead."""
 
 
 def environment(task: str | Path | Task | TaskProgram, num_envs: int = 1, **how: Any) -> CompiledEnv:
@@ -107,7 +104,6 @@ class MixedEnv(CompiledEnv):
         self._envs: dict[int, CompiledEnv] = {}
         self._groups: dict[int, tuple[CompiledEnv, Array]] = {}
         """The environment of the episodes under each ruleset, and the numbers of these episodes, int64 [n]."""
-        self._depth = min(MOST_AHEAD, POOL_CELLS // (num_envs * self.task.size[0] * self.task.size[1]))
         self._ahead: dict[int, tuple[dict[int, int], Episodes]] = {}
         """By ruleset: start worlds made ahead, and the place of each world's number in them."""
         self._ahead_from: tuple[Tensor, Tensor] | None = None
@@ -142,8 +138,7 @@ class MixedEnv(CompiledEnv):
         numbers = self.program.ruleset_of(worlds).numpy()
         for number in numbers[rows].tolist():
             self._env(number)  # raises before anything has changed
-        began = np.zeros(self.num_envs, bool)
-        began[rows] = True
+        began = mask.numpy()
         for number in sorted({*self._groups, *numbers[rows].tolist()}):
             old = self._groups[number][1] if number in self._groups else rows[:0]
             staying, new = ~began[old], rows[numbers[rows] == number]
@@ -173,18 +168,16 @@ class MixedEnv(CompiledEnv):
         """Return the start of episodes under a ruleset: worlds that were made ahead, or new ones."""
         program, (places, ahead) = self._env(number).program, self._ahead.get(number, ({}, None))
         rows = [places.get(world, -1) for world in worlds.tolist()]
-        return (
-            program.start(worlds)
-            if ahead is None or -1 in rows
-            else program.select(ahead, torch.tensor(rows))
-        )
+        if ahead is None or -1 in rows:
+            return program.start(worlds)
+        return program.select(ahead, torch.tensor(rows))
 
-    def _make_ahead(self, base: Tensor, first: Tensor) -> None:
-        """Make start worlds under the rulesets in use, from the episodes `first`, int64 [B], on.
+    def _make_ahead(self, base: Tensor, first: Tensor, depth: int) -> None:
+        """Make start worlds of `depth` episodes from `first`, int64 [B], on, under the rulesets in use.
 
         A batch of many worlds takes little longer than one of a few.
         """
-        episodes = first + torch.arange(self._depth)[:, None]
+        episodes = first + torch.arange(depth)[:, None]
         worlds = self._choose(base.expand_as(episodes).flatten(), episodes.flatten()).unique()
         rulesets, self._ahead, self._ahead_from = self.program.ruleset_of(worlds), {}, (base, first)
         for number, env in self._envs.items():
@@ -273,11 +266,12 @@ class MixedEnv(CompiledEnv):
         assert self._base is not None
         self._episode, rows = self._episode + mask, mask.nonzero()[:, 0]
         self._returned = self._returned.masked_fill(mask, 0)
-        if self.curriculum is None and self._depth > 1:
+        depth = episodes_ahead(self.num_envs, self.task.size)
+        if self.curriculum is None and depth > 1:
             base, first = self._ahead_from or (None, self._episode)
-            places = (self._episode - first)[rows]
-            if base is not self._base or not bool(((places >= 0) & (places < self._depth)).all()):
-                self._make_ahead(self._base, self._episode + ~mask)
+            passed = (self._episode - first)[rows]
+            if base is not self._base or not bool(((passed >= 0) & (passed < depth)).all()):
+                self._make_ahead(self._base, self._episode + ~mask, depth)
         worlds = torch.zeros_like(self._episode)
         worlds[rows] = self._choose(self._base[rows], self._episode[rows])
         self._restart(mask, worlds)

@@ -185,9 +185,7 @@ def test_worlds_under_different_rules_do_what_they_do_alone(
     if backend == "native":
         skip_without_compiler()
     count, pool = 7, 40
-    monkeypatch.setattr(
-        "powderdsl.envs.mixed.MOST_AHEAD", 2
-    )  # so that start worlds are made ahead more than once
+    monkeypatch.setattr("powderdsl.envs.compiled.POOL_CELLS", 2 * count * 16 * 16)  # two episodes at once
     how: dict[str, Any] = {"autoreset_mode": mode, "backend": backend, "worlds": pool}
     env = environment(mixed / "mixed.yaml", count, **how)
     players = alone(mixed, count, backend)

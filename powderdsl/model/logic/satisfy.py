@@ -73,7 +73,7 @@ class Facts:
 
     @cached_property
     def known(self) -> Facts:
-        """Facts of the same content, to which answers are kept: the same object for all of them."""
+        """One object for all facts of the same content: the key of cached answers."""
         return _known(
             self.ids, tuple(self.properties.items()), tuple(self.fields.items()), self.side_multiple
         )

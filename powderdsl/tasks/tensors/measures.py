@@ -85,7 +85,7 @@ class Meter:
     ) -> Tensor:
         """The numbers of all measures: float64 [B, n]. `params` are those that differ from the rules' own.
 
-        Packed worlds are not unpacked for measures on bit planes. `known`: numbers to complete, which has these.
+        Packed worlds are not unpacked for measures on bit planes. `known`: completed if it has these already.
         """
         values, state, counts = known, world.state, None
         if values is None:

@@ -139,7 +139,7 @@ class Start:
         return replace(self, ids=kept(self.ids), fields=fields)
 
     def world(self, simulator: Simulator, ruleset: Ruleset | None = None) -> World:
-        """The same worlds for any simulator of the ruleset. `ruleset`: whose slots are set, if the simulator has more."""
+        """The same worlds for any simulator of the ruleset. `ruleset`: the rules whose slots to set, if the simulator has more."""
         world, put = simulator.world(self.ids, self.seed, index=self.index), simulator.kind.from_numpy
         dtypes = {slot.name: slot.dtype for slot in simulator.slots}
         values = full_state(ruleset or simulator.ruleset, self).items()
