@@ -36,8 +36,8 @@ struct Context {
   Grid g;
   std::vector<int> wrapped;  // [height + 32]: word offset of row y - 16 on the torus, for strips in the halo
   std::vector<int> lines;    // [height of a world + 32]: row y - 16 of a world on the torus
-  std::vector<Plane*> planes, all_planes;
-  std::vector<Field*> fields, all_fields;
+  std::vector<Plane*> planes;  // free ones
+  std::vector<Field*> fields;
   Plane *nothing, *everything;
   Field* calm;  // no row of it is live
   V* nothing_row;
@@ -129,7 +129,8 @@ static Field* new_field(const Grid& g) {
 static void drop(const Grid& g, Plane* p) { drop(spare_planes, p, plane_size(g), SPARE_BYTES / plane_size(g)); }
 static void drop(const Grid& g, Field* f) { drop(spare_fields, f, field_size(g) + g.height, SPARE_BYTES / field_size(g)); }
 
-ALWAYS Plane* take(Context& c) {
+// Not inline: what runs once in a while would fill the processor's instruction cache.
+OUTLINE Plane* take(Context& c) {
   Plane* p;
   if (c.planes.empty()) {
     p = new_plane(c.g);
@@ -142,8 +143,9 @@ ALWAYS Plane* take(Context& c) {
   return p;
 }
 ALWAYS Plane* keep(Plane* p) { p->refs++; return p; }
+OUTLINE void put(Context& c, Plane* p) { c.planes.push_back(p); }
 ALWAYS void give(Context& c, Plane* p) {
-  if (--p->refs == 0) c.planes.push_back(p);
+  if (--p->refs == 0) put(c, p);
 }
 ALWAYS Field* take_field(Context& c) {
   Field* f;

@@ -45,23 +45,22 @@ def pass_text(schedule: Schedule, number: int, layout: NativeLayout) -> str:
     for slot, var in schedule.inputs:
         del rest[var.name]
         place = printer.slot(slot, var)
-        if slot in changed:  # no other reference exists while the pass runs, so it may be overwritten
-            lines.append(f"{KINDS[var.type.name]}* {var.name} = {place}; {place} = nullptr;")
+        if slot in changed:  # without a second reference, so that it may be overwritten
+            lines.append(f"{KINDS[var.type.name]}* {var.name} = {place};")
         else:
             lines.append(f"{KINDS[var.type.name]}* {var.name} = keep({place});")
     for var in rest.values():
         lines.append(f"{KINDS[var.type.name]}* {var.name};")
     lines += printer.block(schedule.body)
-    places, names = [], {}
-    for i, (slot, node) in enumerate(schedule.outputs):
+    inputs, stored = dict(schedule.inputs), set()
+    for slot, node in schedule.outputs:
         var = Var(storage_of(node), node.type)
-        lines.append(f"{KINDS[var.type.name]}* s{i} = keep({var.name});")
-        places.append(printer.slot(slot, var))
-        if node.op == "load":
-            names[var.name] = f"give(c, {var.name});"
-    for i, place in enumerate(places):  # all new values are read before any is stored
-        lines.append(f"if ({place}) give(c, {place}); {place} = s{i};")
-    return "\n".join([*lines, " ".join(names.values()), "}"])
+        place, is_last = printer.slot(slot, var), node.op == "load" and var.name not in stored
+        stored.add(var.name)
+        if slot not in inputs:
+            lines.append(f"give(c, {place});")
+        lines.append(f"{place} = {var.name if is_last else f'keep({var.name})'};")
+    return "\n".join([*lines, "}"])
 
 
 KINDS = {"real": "Field", "flag": "Plane"}
