@@ -22,6 +22,7 @@ from powderdsl.targets.cpp.program import NativeProgram, PackedState, Places
 from powderdsl.tasks.compiled import Arguments, Results, operations
 from powderdsl.tasks.episodes import Episodes, params_of
 from powderdsl.tasks.goals import ACTION_WORDS
+from powderdsl.tasks.tensors.actions import CLOCK
 from powderdsl.tasks.tensors.measures import Masks
 
 POOL_CELLS = 1 << 22
@@ -42,6 +43,16 @@ def episodes_ahead(worlds: int, size: tuple[int, int]) -> int:
 
 Steps = tuple[Any, Any, Any, Any, dict[str, Any]]
 """Observations, reward, terminated, truncated and infos: arrays."""
+
+
+def side_by_side(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """Return contiguous copies of tensors in one memory, since few worlds fit into one cache line each."""
+    sizes = [-(-tensor.nbytes // 8) * 8 for tensor in tensors.values()]
+    parts = torch.empty(sum(sizes), dtype=torch.uint8).split(sizes)
+    return {
+        name: part[: tensor.nbytes].view(tensor.dtype).view(tensor.shape).copy_(tensor)
+        for (name, tensor), part in zip(tensors.items(), parts, strict=True)
+    }
 
 
 class Plan(Arguments):
@@ -101,65 +112,71 @@ class Stepper(Plan):
 
     def __init__(self, env: TensorEnv, native: NativeProgram):
         super().__init__(env, native)
-        self.native, self.play.threads = native, native.threads
+        self.native = native
         self.filled: Tensor | None = None
         """int64 [B]: the first episode of each row whose start world has not been made."""
         self._ahead: Episodes | None = None
         self._play = ctypes.byref(self.play)
         self._has_maps = False
 
-    def bind(self, episodes: Episodes, params: Mapping[str, Tensor], kept: Mapping[str, Tensor]) -> Episodes:
+    def bind(
+        self, episodes: Episodes, params: Mapping[str, Tensor], kept: Mapping[str, Tensor], running: int = 0
+    ) -> Episodes:
         """Return the episodes in memory that later steps write to.
 
-        `params` are float64 [B] each, as `TaskProgram.act` takes them; `kept` are an environment's tensors by the names of `Play`, [B] each: ``episode``,
-        ``returned``, and ``waiting``, the episodes that are over.
+        Args:
+            params: float64 [B] each, as `TaskProgram.act` takes them.
+            kept: an environment's tensors by the names of `Play`, [B] each: ``episode``, ``returned``, and ``waiting``,
+                the episodes that are over.
+            running: the usual number of episodes that are not idle; 0: all.
         """
         world, worlds = episodes.world, len(episodes)
-        state = self.native.pack(world.state)
+        state = self.native.pack(world.state, running)
+        names = ("acted", "failed", "start", "before")
         # Copies: `start` and `before`, and numbers of worlds, may be the same tensors.
-        clock = [tensor.clone() for tensor in (world.seed, world.index, world.step)]
-        names = ("seed", "acted", "failed", "start", "before")
-        rows = {name: getattr(episodes, name).clone(memory_format=torch.contiguous_format) for name in names}
-        masks = Masks(episodes.masks.words.clone(), episodes.masks.sizes.clone())
+        tensors = side_by_side(
+            {name: getattr(world, name) for name in CLOCK}
+            | {name: getattr(episodes, name) for name in names}
+            | {"world": episodes.seed, "masks": episodes.masks.words, "sizes": episodes.masks.sizes}
+            | {"now": episodes.before, "action": torch.zeros(worlds, len(ACTION_WORDS), dtype=torch.int64)}
+            | {"begins": torch.zeros(worlds, dtype=torch.bool)}
+        )
+        self._now, self.begins = tensors["now"], tensors["begins"]
         own = {name: cells.clone() for name, cells in self._own(episodes.regions).items()}
         self.episodes = replace(
             episodes,
-            world=World(self.program.simulator, state, *clock),
+            world=World(self.program.simulator, state, tensors["seed"], tensors["index"], tensors["step"]),
+            seed=tensors["world"],
             regions={**episodes.regions, **own},
             targets={name: target.clone() for name, target in episodes.targets.items()},
             params={name: value.clone() for name, value in episodes.params.items()},
-            masks=masks,
-            **rows,
+            masks=Masks(tensors["masks"], tensors["sizes"]),
+            **{name: tensors[name] for name in names},
         )
         self._has_maps = bool(own or episodes.targets or episodes.params)
         self._overrides = params
         chosen, simulator = params_of(episodes, params), self.program.simulator
         self._params = simulator.parameters(chosen, worlds) if chosen else simulator.defaults(worlds)
-        self._inputs = inputs = self.native.inputs(self._params, worlds)
+        inputs = self.native.inputs(self._params, worlds)
+        if episodes.params:  # `_copy_maps` writes to them
+            bits, reals = (part.repeat(worlds // len(part), 1) for part in inputs[1:])
+            inputs = inputs._replace(bits=bits, reals=reals)
+        self._inputs = inputs
         if self.filled is None or len(self.filled) != worlds:
             self.filled, self._ahead = torch.zeros(worlds, dtype=torch.int64), None
-        self._now = torch.zeros_like(rows["before"])
-        self.begins = torch.zeros(worlds, dtype=torch.bool)
-        clocks = zip(("seed", "index", "step"), clock, strict=True)
-        rows["world"] = rows.pop("seed")
         self.read_from(np.empty((worlds, self.play.numbers), np.int64))
         self._results: Results | None = None
         self._tensors: dict[str, Tensor] = {
-            **dict(clocks),
-            **rows,
+            **tensors,
             **kept,
-            "param_planes": inputs.planes,
+            "param_bits": inputs.bits,
             "param_reals": inputs.reals,
-            "now": self._now,
-            "masks": masks.words,
-            "sizes": masks.sizes,
-            "action": torch.zeros(worlds, len(ACTION_WORDS), dtype=torch.int64),
-            "begins": self.begins,
             "filled": self.filled,
         }
         for name, tensor in self._tensors.items():
             setattr(self.play, name, tensor.data_ptr())
-        self.play.mask_words, self.play.own_masks = masks.words[0].numel(), self.program.meter.own
+        self.play.threads, self.play.own_params = self.native.threads, inputs.own
+        self.play.mask_words, self.play.own_masks = tensors["masks"][0].numel(), self.program.meter.own
         return self.episodes
 
     def write_to(self, results: Results) -> None:
@@ -178,7 +195,7 @@ class Stepper(Plan):
         changed then).
         """
         library, play, address = self.native.library, self._play, self._numbers_at
-        self._state().forget()
+        self.prepare()
         if not self.measures_cells:
             status: int = library.pd_play(play, address)
             if status == READY and self._has_maps:
@@ -196,17 +213,37 @@ class Stepper(Plan):
         self.begin()
         return READY
 
+    def rest(self, idle: Any) -> None:
+        """Let the next calls skip the episodes where `idle`, bool [B], is set."""
+        self.prepare()
+        self.native.library.pd_rest(self.play.batch, idle.ctypes.data)
+
+    def enter(self, ahead: Episodes, places: Tensor, rows: Tensor) -> None:
+        """Begin the episodes `places` of `ahead` in some rows, int64 [n] each, and write observations."""
+        self._draw_from(ahead)
+        self._entry = torch.zeros(len(self.begins), dtype=torch.int64)
+        self._entry[rows], self.begins[rows] = places, True
+        self.play.entry = self._entry.data_ptr()
+        self.begin()
+        self.begins.zero_()
+
     def begin(self) -> None:
         """Begin the next episodes where `begins` is set, and write observations."""
-        self._state().forget()
+        self.prepare()
         self.native.library.pd_begin(self._play)
         self._copy_maps()
 
-    def _state(self) -> PackedState:
-        """Return the worlds that the library writes to. Raises RuntimeError if they were stepped with `reuse`."""
+    def prepare(self) -> None:
+        """Let the library write to the worlds. Raises RuntimeError if they were stepped with `reuse`."""
         state: PackedState = self.episodes.world.state  # type: ignore[assignment]
         self.play.batch = state.handle
-        return state
+        state.forget()
+
+    @property
+    def call(self) -> tuple[int, int, int]:
+        """The addresses of `pd_play`, of its `Play` and of the actions."""
+        function = ctypes.cast(self.native.library.pd_play, ctypes.c_void_p).value
+        return function or 0, ctypes.addressof(self.play), self._numbers_at
 
     def _own(self, regions: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """Return the regions that differ between worlds."""
@@ -218,7 +255,10 @@ class Stepper(Plan):
             return
         own = self._own(self.episodes.regions)
         rows = self.begins.nonzero()[:, 0]
-        places = rows * self.play.depth + self._tensors["episode"][rows] % self.play.depth
+        if self.play.entry:
+            places = self._entry[rows]
+        else:
+            places = rows * self.play.depth + self._tensors["episode"][rows] % self.play.depth
         for name, cells in own.items():
             cells[rows] = self._ahead.regions[name][places]
         for name, target in self.episodes.targets.items():
@@ -228,9 +268,9 @@ class Stepper(Plan):
                 drawn[rows] = self._ahead.params[name][places]
             for name, value in (params_of(self.episodes, self._overrides) or {}).items():
                 self._params[name].copy_(value)
-            own_params = {name: value[rows] for name, value in self._params.items()}
-            bits, floats = self.native.layout.parameters(torch, own_params, len(rows))
-            self._inputs.planes[:, rows], self._inputs.reals[:, rows] = bits, floats
+            own = {name: value[rows] for name, value in self._params.items()}
+            parts = self.native.layout.parameters(torch, own, len(rows))
+            self._inputs.bits[rows], self._inputs.reals[rows] = (part.T for part in parts)
 
     def fill(self, numbers: Callable[[Tensor, Tensor], Tensor]) -> None:
         """Make the start worlds of the next episodes if one that begins lacks its own.
@@ -252,9 +292,12 @@ class Stepper(Plan):
         ahead = self.program.start(numbers(rows[order], episodes[order]), self.native)
         if self._ahead is not None:
             ahead = self.program.put(self._ahead, places[order], ahead, reuse=True)
-        self._ahead = ahead
-        state: PackedState = ahead.world.state  # type: ignore[assignment]
         self.filled.copy_(end)
+        self._draw_from(ahead)
+
+    def _draw_from(self, ahead: Episodes) -> None:
+        """Let episodes begin in start worlds of a pool."""
+        self._ahead, self._pool = ahead, (state := self.native.pack(ahead.world.state))
         self.play.pool, self.play.pool_world = state.handle, ahead.seed.data_ptr()
         self.play.pool_start, self.play.pool_sizes = ahead.start.data_ptr(), ahead.masks.sizes.data_ptr()
         self.play.pool_masks = ahead.masks.words.data_ptr()
@@ -270,6 +313,8 @@ class CompiledEnv(TensorEnv):
     _results: Sequence[Results] = ()
     _bound: tuple[Any, Any] = (None, None)
     """The episodes and parameters of the stepper."""
+    running = 0
+    """The usual number of episodes that are not idle; 0: all."""
 
     def _ready(self) -> Stepper | None:
         """Return the stepper of the current episodes; None if they do not run as native code."""
@@ -285,13 +330,17 @@ class CompiledEnv(TensorEnv):
             self._stepper = Stepper(self, native)
         self._results = ()
         kept = {"episode": self._episode, "returned": self._returned, "waiting": self._ended}
-        self.episodes = self._stepper.bind(self.episodes, self.params, kept)
+        self.episodes = self._stepper.bind(self.episodes, self.params, kept, self.running)
         self._waiting, numbers = self._ended.numpy(), self._stepper.numbers
         self._places = numbers[:, 0] if self.action_form.kind == "discrete" else numbers
         if self.observation.kind == "laws":
             self._laws = self.program.law_bytes(self.episodes).numpy()
         self._bound = self.episodes, self.params
         return self._stepper
+
+    def unbind(self) -> None:
+        """Let the next call lay out the episodes anew."""
+        self._bound = None, None
 
     def reset(
         self, *, seed: int | Sequence[int | None] | None = None, options: Mapping[str, Any] | None = None

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+import operator
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -31,49 +33,78 @@ def environment(task: str | Path | Task | TaskProgram, num_envs: int = 1, **how:
     return (MixedEnv if program.is_mixed else CompiledEnv)(program, num_envs, **how)
 
 
+MOST_ROWS = 4
+"""Maximum number of rows, for each environment, that are kept for later episodes."""
+
 COLUMNS = ("observed", "reward", "terminated", "truncated", "success", "episode_return", "episode_length")
 """The results of a step, one row per episode: names of `Results`."""
 
 
 class Joint:
-    """Steps the episodes of several steppers, one call each, into shared memory.
+    """Steps the episodes of several steppers in one call, into shared memory.
 
     Args:
-        steppers: in order.
-        members: the numbers of their episodes, int64 [B].
+        steppers: in order. The rows of their episodes follow one another.
         shape: of one observation.
         dtype: of observations.
     """
 
-    def __init__(self, steppers: Sequence[Stepper], members: Array, shape: tuple[int, ...], dtype: Any):
-        self._steppers, self._members = steppers, members
-        order, sizes = np.argsort(members), [len(stepper.begins) for stepper in steppers]
-        self._order = order
-        self._numbers = np.empty((len(members), steppers[0].play.numbers), np.int64)
-        self._observed = np.zeros((len(members), *shape), dtype)
-        self._shown: list[ReusedArray] = []
+    def __init__(self, steppers: Sequence[Stepper], shape: tuple[int, ...], dtype: Any):
+        self._steppers, sizes = steppers, [len(stepper.begins) for stepper in steppers]
         ends = np.cumsum([0, *sizes])
+        self._numbers = np.zeros((ends[-1], steppers[0].play.numbers), np.int64)
+        self.observed = np.zeros((ends[-1], *shape), dtype)
+        """The last observations of all rows."""
+        self._shown: list[ReusedArray] = []
         memory = np.empty(int(Results.SIZE * ends[-1]), np.uint8)
         columns: list[list[Array]] = [[] for _ in COLUMNS[1:]]
         for stepper, start, end in zip(steppers, ends, ends[1:], strict=False):
-            part = Results(memory[Results.SIZE * start : Results.SIZE * end], self._observed[start:end])
+            part = Results(memory[Results.SIZE * start : Results.SIZE * end], self.observed[start:end])
             stepper.write_to(part)
             stepper.read_from(self._numbers[start:end])
+            stepper.begin()
             for column, name in zip(columns, COLUMNS[1:], strict=True):
                 column.append(getattr(part, name))
-        self._places = [(memory.view(column[0].dtype), _places(memory, column)[order]) for column in columns]
+        self._columns = [(memory.view(column[0].dtype), _places(memory, column)) for column in columns]
+        self._bound = [stepper.episodes for stepper in steppers]
+        self._calls = np.array([stepper.call for stepper in steppers], np.int64)
+
+    def has(self, steppers: Sequence[Stepper]) -> bool:
+        """True if these are its steppers, and none has been bound to other episodes."""
+        bound = [stepper.episodes for stepper in steppers]
+        return len(bound) == len(self._bound) and all(map(operator.is_, bound, self._bound))
+
+    def seat(self, members: Sequence[Array]) -> None:
+        """Continue with the episodes of these numbers in the rows of each stepper, int64 [n]; −1: the row is idle."""
+        numbers = np.concatenate(members)
+        self.rows = np.argsort(numbers, kind="stable")[np.count_nonzero(numbers < 0) :]
+        """The row of each episode: int64 [B]."""
+        self._places = [(values, places[self.rows]) for values, places in self._columns]
+        busy = np.array([bool((own >= 0).any()) for own in members])
+        threads = self._steppers[0].native.threads
+        self._threads = threads if busy.sum() >= threads else 1
+        for stepper, own in zip(self._steppers, members, strict=True):
+            stepper.rest(own < 0)
+            stepper.play.threads = threads // self._threads
+        together = busy & [not stepper.measures_cells for stepper in self._steppers]
+        self._together = np.ascontiguousarray(self._calls[together].T)
+        self._apart = [self._steppers[int(place)] for place in np.flatnonzero(busy & ~together)]
 
     def step(self, actions: Array) -> list[Array]:
         """Step all episodes: the columns of `COLUMNS`, in the order of their numbers."""
-        np.take(actions.reshape(self._numbers.shape), self._members, 0, self._numbers, mode="clip")
+        self._numbers[self.rows] = actions.reshape(len(self.rows), -1)
         for stepper in self._steppers:
+            stepper.prepare()
+        addresses = [row.ctypes.data for row in self._together]
+        self._steppers[0].native.library.pd_play_all(self._together.shape[1], *addresses, self._threads)
+        for stepper in self._apart:
             stepper.step()
         shown = next(filter(ReusedArray.is_free, self._shown), None)
         if shown is None:
-            shown = ReusedArray(self._observed.shape, self._observed.dtype)
+            shown = ReusedArray((len(self.rows), *self.observed.shape[1:]), self.observed.dtype)
             self._shown = [shown, *self._shown[:2]]
         # Other modes make another copy.
-        np.take(self._observed, self._order, 0, shown.rows, mode="clip")
+        np.take(self.observed, self.rows, 0, shown.rows, mode="clip")
         return [shown.rows, *(values[places] for values, places in self._places)]
 
 
@@ -83,6 +114,10 @@ def _places(memory: Array, parts: Sequence[Array]) -> Array:
     return np.concatenate(
         [(part.ctypes.data - start) // part.itemsize + np.arange(len(part)) for part in parts]
     )
+
+
+Groups = dict[int, tuple[CompiledEnv, Array]]
+"""By ruleset: the environment of the episodes under it, and the numbers of these episodes, int64 [n]; −1: the row is idle."""
 
 
 class MixedEnv(CompiledEnv):
@@ -101,9 +136,11 @@ class MixedEnv(CompiledEnv):
 
     def __init__(self, task: str | Path | Task | TaskProgram, num_envs: int = 1, **how: Any):
         super().__init__(task, num_envs, **how)
+        self._joint: Joint | None = None
+        self._actions = np.empty((self.num_envs, *(self.single_action_space.shape or ())), np.int64)
+        self._most = np.array(self.action_nvec, np.uint64)
         self._envs: dict[int, CompiledEnv] = {}
-        self._groups: dict[int, tuple[CompiledEnv, Array]] = {}
-        """The environment of the episodes under each ruleset, and the numbers of these episodes, int64 [n]."""
+        self._groups: Groups = {}
         self._ahead: dict[int, tuple[dict[int, int], Episodes]] = {}
         """By ruleset: start worlds made ahead, and the place of each world's number in them."""
         self._ahead_from: tuple[Tensor, Tensor] | None = None
@@ -134,43 +171,67 @@ class MixedEnv(CompiledEnv):
 
     def _restart(self, mask: Tensor, worlds: Tensor) -> None:
         """Begin episodes where `mask`, bool [B], is set, in the worlds with these numbers, int64 [B]."""
-        rows = mask.nonzero()[:, 0].numpy()
+        rows, began = mask.nonzero()[:, 0].numpy(), mask.numpy()
         numbers = self.program.ruleset_of(worlds).numpy()
         for number in numbers[rows].tolist():
             self._env(number)  # raises before anything has changed
-        began = mask.numpy()
-        for number in sorted({*self._groups, *numbers[rows].tolist()}):
-            old = self._groups[number][1] if number in self._groups else rows[:0]
-            staying, new = ~began[old], rows[numbers[rows] == number]
-            if staying.all() and not len(new):
+        groups, entering = dict(self._groups), []
+        for number in sorted({*groups, *numbers[rows].tolist()}):
+            env, members = groups.get(number, (self._env(number), rows[:0]))
+            leaving, new = (members >= 0) & began[members], rows[numbers[rows] == number]
+            if not leaving.any() and not len(new):
                 continue
-            members = np.concatenate([old[staying], new])
-            if not len(members):
-                del self._groups[number]
-                continue
-            env = self._env(number)
-            self._groups[number] = env, members
-            episodes = self._start(number, worlds[new]) if len(new) else None
-            if staying.any():
-                assert env.episodes is not None
-                count = int(staying.sum())
-                places = torch.from_numpy(np.flatnonzero(staying))
-                repeated = torch.cat([places, places[:1].expand(len(new))])
-                whole, last = env.program.select(env.episodes, repeated), torch.arange(count, len(members))
-                episodes = whole if episodes is None else env.program.put(whole, last, episodes, reuse=True)
-            assert episodes is not None
-            known = {param.name for param in env.task.ruleset.params}
-            params = {name: value[members] for name, value in self.params.items() if name in known}
-            env.adopt(episodes, self._returned.masked_fill(mask, 0)[members], params)
-        self.episodes = self._regroup(dict(sorted(self._groups.items())))
+            members = np.where(leaving, -1, members)
+            free = np.flatnonzero(members < 0)[: len(new)]
+            if self._joint is None or len(free) < len(new) or (self.params and len(new)):
+                members = self._rebuild(number, members, new, worlds)
+            elif len(new):
+                members[free] = new
+                entering.append((number, free, worlds[new]))
+            groups[number] = env, members
+        size = sum(len(members) for _, members in groups.values())
+        if self._joint is None or size > MOST_ROWS * self.num_envs:
+            groups = {number: group for number, group in groups.items() if (group[1] >= 0).any()}
+        self.episodes = self._regroup(dict(sorted(groups.items())), entering)
 
-    def _start(self, number: int, worlds: Tensor) -> Episodes:
-        """Return the start of episodes under a ruleset: worlds that were made ahead, or new ones."""
-        program, (places, ahead) = self._env(number).program, self._ahead.get(number, ({}, None))
+    def _rebuild(self, number: int, members: Array, new: Array, worlds: Tensor) -> Array:
+        """Make room for new episodes under a ruleset. Returns the numbers of all its episodes, −1 in idle rows.
+
+        `members` are those of its rows so far; the environments `new`, int64 [n], begin in their `worlds`, int64 [B].
+        """
+        env, staying = self._env(number), np.flatnonzero(members >= 0)
+        stay, count, idle, env.running = len(staying), len(staying) + len(new), 0, 0
+        if env.simulator.native(self.task.size[1]) is not None:
+            usual = self.num_envs // len(self.program.rulesets)
+            idle = max(usual + 3 * math.isqrt(usual), count + count // 4) - count
+            env.running = max(usual, count // 2, 1)
+        members = np.concatenate([members[staying], new, np.full(idle, -1)])
+        if not count:
+            return members
+        episodes = None
+        if len(new):
+            ahead, entries = self._starts(number, worlds[new])
+            episodes = env.program.select(ahead, torch.cat([entries, entries[:1].expand(idle)]))
+        if stay:
+            assert env.episodes is not None
+            places, rest = torch.from_numpy(staying), torch.arange(stay, count + idle)
+            whole = env.program.select(env.episodes, torch.cat([places, places[:1].expand(len(rest))]))
+            episodes = env.program.put(whole, rest, episodes, reuse=True) if episodes else whole
+        assert episodes is not None
+        known = {param.name for param in env.task.ruleset.params}
+        params = {name: value[members] for name, value in self.params.items() if name in known}
+        returned = self._returned[members]
+        returned[stay:] = 0
+        env.adopt(episodes, returned, params)
+        return members
+
+    def _starts(self, number: int, worlds: Tensor) -> tuple[Episodes, Tensor]:
+        """Return starts of episodes under a ruleset, and the places among them of worlds, int64 [n]."""
+        env, (places, ahead) = self._env(number), self._ahead.get(number, ({}, None))
         rows = [places.get(world, -1) for world in worlds.tolist()]
         if ahead is None or -1 in rows:
-            return program.start(worlds)
-        return program.select(ahead, torch.tensor(rows))
+            return env.program.start(worlds, env.simulator.native(self.task.size[1])), torch.arange(len(rows))
+        return ahead, torch.tensor(rows)
 
     def _make_ahead(self, base: Tensor, first: Tensor, depth: int) -> None:
         """Make start worlds of `depth` episodes from `first`, int64 [B], on, under the rulesets in use.
@@ -184,19 +245,31 @@ class MixedEnv(CompiledEnv):
             own = worlds[rulesets == number]
             if len(own):
                 places = {world: place for place, world in enumerate(own.tolist())}
-                self._ahead[number] = places, env.program.start(own)
+                self._ahead[number] = places, env.program.start(own, env.simulator.native(self.task.size[1]))
 
-    def _regroup(self, groups: dict[int, tuple[CompiledEnv, Array]]) -> Episodes:
-        """Continue with these groups. Returns their episodes."""
-        self._groups = groups
-        members = np.concatenate([rows for _, rows in groups.values()])
+    def _regroup(self, groups: Groups, entering: Sequence[tuple[int, Array, Tensor]] = ()) -> Episodes:
+        """Continue with these groups. Returns their episodes.
+
+        `entering`: the ruleset, rows and worlds, int64 [n] each, of episodes that begin in idle rows.
+        """
+        self._groups, members = groups, [rows for _, rows in groups.values()]
+        steppers = [env._ready() for env, _ in groups.values()]
+        ready = [stepper for stepper in steppers if stepper is not None]
+        if len(ready) < len(steppers):
+            self._joint = None
+            for env, _ in groups.values():
+                env.unbind()  # from the memory that steppers shared
+        elif self._joint is None or not self._joint.has(ready):
+            space = self.observation.space
+            self._joint = Joint(ready, space.shape, space.dtype)
+        if self._joint is not None:
+            self._joint.seat(members)
+        for number, rows, worlds in entering:
+            stepper, (ahead, entries) = groups[number][0]._stepper, self._starts(number, worlds)
+            assert stepper is not None
+            stepper.enter(ahead, entries, torch.from_numpy(rows))
         episodes = MixedEpisodes([*groups.values()])
         self._order = episodes.order.numpy()
-        steppers = [env._ready() for env, _ in groups.values()]
-        space, ready = self.observation.space, [stepper for stepper in steppers if stepper is not None]
-        self._joint = None
-        if len(ready) == len(steppers):
-            self._joint = Joint(ready, members, space.shape, space.dtype)
         if self.observation.kind == "laws":
             self._laws = episodes.joined(TaskProgram.law_bytes).numpy()
         return episodes  # type: ignore[return-value]  # same attributes
@@ -211,13 +284,19 @@ class MixedEnv(CompiledEnv):
 
     def step_arrays(self, actions: Any) -> Steps:
         """Act once in every episode: `step` with NumPy arrays."""
-        self._checked(actions)
+        mode, numbers = self.autoreset_mode, self._actions
+        self._read(actions, numbers)
+        if (
+            self.episodes is None
+            or mode is AutoresetMode.DISABLED
+            or (numbers.view(np.uint64) >= self._most).any()
+        ):
+            self._checked(actions)
         assert self.episodes is not None
-        numbers, mode = np.asarray(actions), self.autoreset_mode
         step = self._step_apart if self._joint is None else self._joint.step
         observed, reward, terminated, truncated, success, returned, length = step(numbers)
         if self.observation.kind == "laws":
-            observed[:, 1].reshape(self.num_envs, -1)[:, : self._laws.shape[1]] = self._laws
+            self._write_own(observed, slice(None))
         active = np.ones(self.num_envs, bool)
         waiting = self._ended
         if mode is AutoresetMode.NEXT_STEP:
@@ -250,6 +329,10 @@ class MixedEnv(CompiledEnv):
             info["_action_mask"] = info["_world"]
         return observed, reward, terminated, truncated, info
 
+    def _write_own(self, observed: Array, envs: Any) -> None:
+        """Write the laws of some environments into their observations, [n, …]."""
+        observed[:, 1].reshape(len(observed), -1)[:, : self._laws.shape[1]] = self._laws[envs]
+
     def _step_apart(self, actions: Array) -> list[Array]:
         """Step environment after environment; the columns of `COLUMNS`, rows in the order of `self`."""
         parts = []
@@ -266,8 +349,8 @@ class MixedEnv(CompiledEnv):
         assert self._base is not None
         self._episode, rows = self._episode + mask, mask.nonzero()[:, 0]
         self._returned = self._returned.masked_fill(mask, 0)
-        depth = episodes_ahead(self.num_envs, self.task.size)
-        if self.curriculum is None and depth > 1:
+        depth = 2 * episodes_ahead(self.num_envs, self.task.size)  # more, since batches are small
+        if self.curriculum is None:
             base, first = self._ahead_from or (None, self._episode)
             passed = (self._episode - first)[rows]
             if base is not self._base or not bool(((passed >= 0) & (passed < depth)).all()):
@@ -276,12 +359,17 @@ class MixedEnv(CompiledEnv):
         worlds[rows] = self._choose(self._base[rows], self._episode[rows])
         self._restart(mask, worlds)
         begun = mask.numpy()
+        if self._joint is not None:
+            shown = self._joint.observed[self._joint.rows[begun]]
+            if self.observation.kind == "laws":
+                self._write_own(shown, begun)
+            observed[begun] = shown
+            return
         for env, members in self._groups.values():
-            if begun[members].any():
+            places = np.flatnonzero((members >= 0) & begun[members])
+            if len(places):
                 assert env.episodes is not None
-                places = torch.from_numpy(np.flatnonzero(begun[members]))
-                shown = env.observation.of(env.episodes)
-                observed[members[places]] = shown[places].numpy()
+                observed[members[places]] = env.observation.of(env.episodes).numpy()[places]
 
     # Saving
 
@@ -299,11 +387,12 @@ class MixedEnv(CompiledEnv):
             if not 0 <= number < len(self.program.rulesets):
                 raise ValueError(f"no ruleset {number}: there are {len(self.program.rulesets)}")
         members = np.concatenate([*rows.values()])
-        if sorted(members.tolist()) != [*range(self.num_envs)]:
+        if sorted(members[members >= 0].tolist()) != [*range(self.num_envs)]:
             raise ValueError("the saved worlds are not those of an environment")
         groups = {number: (self._env(number), own) for number, own in rows.items()}
         for number, (env, own) in groups.items():
             env.num_envs = len(own)
             env.restore(state["groups"][number]["env"])
-        self._returned[members] = torch.cat([env.returns for env, _ in groups.values()])
+        busy, returns = members >= 0, torch.cat([env.returns for env, _ in groups.values()])
+        self._returned[members[busy]] = returns[busy]
         return self._regroup(groups)

@@ -51,7 +51,8 @@ class CompiledSteps(Arguments):
             setattr(structure, name, self.address(name, getattr(episodes, name)))
         inputs = native.inputs(program.simulator.parameters({}, episodes.count), episodes.count)
         self._inputs, self._level = inputs, ctypes.byref(structure)
-        structure.param_planes, structure.param_reals = inputs.planes.data_ptr(), inputs.reals.data_ptr()
+        structure.own_params = inputs.own
+        structure.param_bits, structure.param_reals = inputs.bits.data_ptr(), inputs.reals.data_ptr()
 
     def choose(self, actions: NDArray[np.int64], active: NDArray[np.bool_]) -> None:
         """Take a choice, contiguous int64 [B], in the episodes that are `active`, bool [B]."""

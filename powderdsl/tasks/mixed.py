@@ -42,12 +42,13 @@ class MixedEpisodes:
     """The current episodes of environments in one order, read-only.
 
     Args:
-        groups: environments, and the numbers of their episodes, int64 [n].
+        groups: environments, and the numbers of their episodes, int64 [n]; −1: not one of them.
     """
 
     def __init__(self, groups: Sequence[tuple[Playing, Array]]):
         self._envs = [env for env, _ in groups]
-        self.order = torch.from_numpy(np.argsort(np.concatenate([rows for _, rows in groups])))
+        numbers = np.concatenate([rows for _, rows in groups])
+        self.order = torch.from_numpy(np.argsort(numbers, kind="stable")[np.count_nonzero(numbers < 0) :])
         """The place of each episode in the groups, one after another: int64 [B]."""
         self.seed = self.joined(lambda program, episodes: episodes.seed)
         """The numbers of their start worlds, int64 [B]."""

@@ -172,10 +172,10 @@ def alone(folder: Path, worlds: int, backend: str, **how: Any) -> list[list[Any]
     ]
 
 
-@pytest.mark.parametrize("backend", ["wasm", "native"])
+@pytest.mark.parametrize(("backend", "threads"), [("wasm", 1), ("native", 1), ("native", 2)])
 @pytest.mark.parametrize("mode", MODES)
 def test_worlds_under_different_rules_do_what_they_do_alone(
-    mixed: Path, backend: str, mode: str, monkeypatch: pytest.MonkeyPatch
+    mixed: Path, backend: str, threads: int, mode: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     import torch
 
@@ -186,7 +186,7 @@ def test_worlds_under_different_rules_do_what_they_do_alone(
         skip_without_compiler()
     count, pool = 7, 40
     monkeypatch.setattr("powderdsl.envs.compiled.POOL_CELLS", 2 * count * 16 * 16)  # two episodes at once
-    how: dict[str, Any] = {"autoreset_mode": mode, "backend": backend, "worlds": pool}
+    how: dict[str, Any] = {"autoreset_mode": mode, "backend": backend, "worlds": pool, "threads": threads}
     env = environment(mixed / "mixed.yaml", count, **how)
     players = alone(mixed, count, backend)
     base, episode = 5 + torch.arange(count), torch.zeros(count, dtype=torch.int64)
@@ -239,6 +239,83 @@ def test_worlds_under_different_rules_do_what_they_do_alone(
             assert torch.equal(continued.restore(env.state()), env.observation.of(env.episodes))
             env = continued
     assert ends > count
+
+
+def test_episodes_begin_in_idle_rows(mixed: Path) -> None:
+    from powderdsl.envs.mixed import MixedEnv
+
+    skip_without_compiler()
+    env = MixedEnv(mixed / "mixed.yaml", 24, backend="native")
+    env.reset(seed=1)
+    draws, layouts = random.Random(3), []
+    for _ in range(60):
+        _, _, terminated, truncated, _ = env.step(random_actions(env, draws))
+        if bool((terminated | truncated).any()):
+            layouts.append(env._joint)
+            assert env.episodes is not None
+            rulesets = env.program.ruleset_of(env.episodes.seed)
+            assert env._joint is not None
+            assert len(env._joint.observed) > 24
+            for number, (_, members) in env._groups.items():
+                assert sorted(members[members >= 0]) == (rulesets == number).nonzero()[:, 0].tolist()
+    assert len(layouts) > 4
+    assert len({*map(id, layouts[1:])}) == 1
+
+
+def test_rulesets_join_the_others_when_they_are_compiled(
+    mixed: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    import torch
+
+    from powderdsl.envs.mixed import MixedEnv
+    from powderdsl.simulation.simulator import Simulator
+
+    skip_without_compiler()
+    envs = [MixedEnv(mixed / "mixed.yaml", 9, backend=backend) for backend in ("wasm", "native")]
+    native, slow = Simulator.native, envs[1].program.under(1).simulator.ruleset.name
+    uncompiled, draws = {slow}, random.Random(4)
+    monkeypatch.setattr(
+        Simulator,
+        "native",
+        lambda sim, width: None if sim.ruleset.name in uncompiled else native(sim, width),
+    )
+    for env in envs:
+        env.reset(seed=2, options={"worlds": 0})  # under the first ruleset
+    assert envs[1]._joint is not None
+    for compiled in (False, True):
+        if compiled:
+            uncompiled = {*()}
+        for _ in range(20):
+            actions = random_actions(envs[0], draws)
+            results = [env.step(actions)[:4] for env in envs]
+            assert all(map(torch.equal, *results))
+        assert (envs[1]._joint is not None) == compiled
+
+
+def test_native_worlds_draw_parameters_under_several_rulesets(tmp_path: Path) -> None:
+    import torch
+
+    from powderdsl.envs.mixed import MixedEnv
+
+    skip_without_compiler()
+    text = MELTING.replace("may: any", "may: [ice, lava, water]").replace(
+        "rules: core+water+fire+lava",
+        "rules: core+water+fire+lava\nrulesets: [core+water+fire+lava, core+fire+lava+water]",
+    )
+    (tmp_path / "melting.yaml").write_text(text, encoding="utf-8")
+    envs = [MixedEnv(tmp_path / "melting.yaml", 12, backend=backend) for backend in ("wasm", "native")]
+    draws, some = random.Random(5), torch.arange(12) % 2 == 0
+    for options in (
+        {},
+        {"params": {"water.melt": 0.3}, "reset_mask": some},
+        {"params": {}, "reset_mask": some},
+    ):
+        for env in envs:
+            env.reset(seed=None if options else 6, options=options)
+        for _ in range(16):
+            actions = random_actions(envs[0], draws)
+            assert all(map(torch.equal, *(env.step(actions)[:4] for env in envs)))
+    assert envs[1]._joint is not None
 
 
 def test_faces_show_worlds_under_different_rules(mixed: Path) -> None:

@@ -278,10 +278,11 @@ atexit.register(_end, _running)
 _TYPES = {"p": ctypes.c_void_p, "i": ctypes.c_int, "l": ctypes.c_int64, "f": ctypes.c_float, "-": None}
 
 SIGNATURES = {
-    "pd_new": "p iii",
+    "pd_new": "p iiii",
+    "pd_rest": "- pp",
     "pd_free": "- p",
     "pd_copy": "p p",
-    "pd_run": "p pilippplppp",
+    "pd_run": "p pilippplippp",
     "pd_count": "- ppplplp",
     "pd_load": "- piiipl",
     "pd_store": "- piiiipl",
@@ -293,6 +294,7 @@ SIGNATURES = {
     "pd_finish": "i p",
     "pd_begin": "- p",
     "pd_play": "l pp",
+    "pd_play_all": "- lpppi",
     "pd_choose": "- ppp",
     "pd_observe": "- ppi",
 }

@@ -329,7 +329,7 @@ class _Loop(CellValues[str]):
     def mask(self, node: Node) -> str:
         """The bits of a chunk in a flag's plane."""
         if node.op == "param":
-            word = f"c.param_bits[{self.layout.param_planes[param_key(node)]}][l]"
+            word = f"words_of(c.param_bits[{self.layout.param_planes[param_key(node)]}])[l]"
         else:
             word = self.words.setdefault(str(node.attr), f"m{len(self.words)}")
         return f"(u32)({word} >> (x & (BITS - 1)) & ALL)"

@@ -10,7 +10,14 @@ struct Batch {
   Grid g;
   int worlds;
   std::vector<Group> groups;
+  std::vector<uint8_t> idle;  // whether each world's cells do not matter; empty: they all do
   int lanes() const { return worlds * g.strips; }  // what lies side by side, in all groups
+  bool is_idle(int world) const { return !idle.empty() && idle[world]; }
+  // Whether all worlds of a group are idle, so that it can be skipped.
+  bool rests(int group) const {
+    const int first = group * LANES / g.strips, last = std::min(worlds, ((group + 1) * LANES + g.strips - 1) / g.strips);
+    return !idle.empty() && std::all_of(&idle[first], &idle[first] + (last - first), [](uint8_t each) { return each != 0; });
+  }
   // Where a lane's cells begin in arrays of worlds; `apart`: from one world to the next, `row`: from row to row.
   int64_t at(int lane, int64_t apart, int64_t row) const {
     return lane / g.strips * apart + lane % g.strips * g.height * row;
@@ -19,7 +26,7 @@ struct Batch {
 
 constexpr size_t LARGE_PLANE = 32 << 10;  // bytes from which a plane of LANES worlds is too large to be kept near
 constexpr int GROUP_WORK = 8;             // what a step of a group costs beside that of its words, in words
-// Strips fill lanes where there are few worlds, and keep less at hand where worlds are large.
+// Strips fill lanes where few worlds run, and keep less at hand where worlds are large.
 static Grid make_grid(int worlds, int height, int width) {
   const int words = (width + BITS - 1) / BITS, least_rows = std::max({1, AROUND_ROWS, BEYOND_ROWS});  // only the next strip is asked
   const bool large = sizeof(V) * height * words >= LARGE_PLANE;
@@ -192,19 +199,27 @@ static void look(Context& c) {
   c.present = 0;
   for (int id = 0; id < IDS; id++) c.present |= (u64)(ASKED >> id & 1 && any(found[id])) << id;
 }
-static void run_group(Context& c, Batch& b, int number, long steps, const Clocks& k, const uint8_t* planes, const float* reals) {
+// The bits and numbers of each world, one after another; of one world, unless each has its `own`.
+struct Parameters {
+  bool own;
+  const uint8_t* bits;
+  const float* reals;
+};
+static void load_parameters(Context& c, const Parameters& parameters) {
+  for (int first = 0, end; first < LANES; first = end) {  // lanes with the same parameters
+    const int world = parameters.own ? c.worlds[first] : 0;
+    for (end = first + 1; end < LANES && (!parameters.own || c.worlds[end] == world);) end++;
+    const Flags lanes = flags_of(first, end);
+    const uint8_t* bits = parameters.bits + (size_t)world * PARAM_PLANES;
+    const float* reals = parameters.reals + (size_t)world * PARAM_REALS;
+    for (int i = 0; i < PARAM_PLANES; i++) c.param_bits[i] = (first ? c.param_bits[i] : Flags{}) | (bits[i] ? lanes : Flags{});
+    for (int i = 0; i < PARAM_REALS; i++) std::fill(c.param_real[i] + first, c.param_real[i] + end, reals[i]);
+  }
+}
+static void run_group(Context& c, Batch& b, int number, long steps, const Clocks& k, const Parameters& parameters) {
   c.lanes = std::min(LANES, b.lanes() - number * LANES);
   for (int l = 0; l < LANES; l++) c.worlds[l] = (number * LANES + std::min(l, c.lanes - 1)) / c.g.strips;
-  const int others = c.worlds[LANES - 1] - c.worlds[0];
-  for (int i = 0; i < PARAM_PLANES; i++) {
-    const uint8_t* bits = planes + (size_t)i * b.worlds;
-    const uint8_t* first = bits + c.worlds[0];
-    c.param_bits[i] = splat(*first ? FULL : 0);
-    if (memcmp(first, first + 1, others))  // mostly, all worlds have the same
-      for (int l = 0; l < LANES; l++) c.param_bits[i][l] = bits[c.worlds[l]] ? FULL : 0;
-  }
-  for (int i = 0; i < PARAM_REALS; i++)
-    for (int l = 0; l < LANES; l++) c.param_real[i][l] = reals[(size_t)i * b.worlds + c.worlds[l]];
+  load_parameters(c, parameters);
   for (int i = 0; i < 2; i++) {
     int last = -1;  // strips of a world have the same key
     u32 key = 0;
@@ -287,6 +302,17 @@ static Pool& pool() {  // never destroyed: its threads may outlive main
   return *p;
 }
 #endif
+// Calls a task on `count` threads; the caller is one of them.
+static void on_threads(int count, const std::function<void(int)>& task) {
+#if !defined(__wasm__)
+  if (count > 1) {
+    Hold hold(pool_use);
+    pool().run(count, task);
+    return;
+  }
+#endif
+  task(0);
+}
 
 // Bit `bit` of the cells of a word. Eight bytes at a time: a product moves their lowest bits into one byte.
 template <class T> ALWAYS Word word_of_cells(const T* cell, int count, int bit) {
@@ -329,7 +355,7 @@ template <class T> static void load_values(Batch& b, int slot, int bits, const T
 
 #define API extern "C" __attribute__((visibility("default")))
 static Batch* new_batch(int worlds, const Grid& g) {
-  Batch* b = new Batch{g, worlds, {}};
+  Batch* b = new Batch{g, worlds};
   b->groups.resize((b->lanes() + LANES - 1) / LANES);
   for (Group& group : b->groups) {
     group.present = ~0ull;
@@ -348,8 +374,13 @@ static Batch* new_batch(int worlds, const Grid& g) {
   }
   return b;
 }
-API void* pd_new(int worlds, int height, int width) {  // of a width that the library is for
-  return new_batch(worlds, make_grid(worlds, height, width));
+// Worlds of a width that the library is for. `running`: about how many are not idle; 0: all.
+API void* pd_new(int worlds, int height, int width, int running) {
+  return new_batch(worlds, make_grid(running ? running : worlds, height, width));
+}
+API void pd_rest(void* batch, const uint8_t* idle) {
+  Batch& b = *(Batch*)batch;
+  b.idle.assign(idle, idle + b.worlds);
 }
 API void pd_free(void* batch) {
   Batch* b = (Batch*)batch;
@@ -515,7 +546,7 @@ API void pd_fill(void* batch, int slot, int bits, const void* values, const int6
   else fill_reals(b, slot, boxes, (const float*)values);
 }
 // Runs a batch, or a copy of it, and returns what has run. `seconds`: null, or to which each pass adds its time.
-API void* pd_run(void* batch, int copy, int64_t steps, int threads, const u64* seed, const u64* index, const u64* step, int64_t since, const uint8_t* planes, const float* reals, double* seconds) {
+API void* pd_run(void* batch, int copy, int64_t steps, int threads, const u64* seed, const u64* index, const u64* step, int64_t since, int own, const uint8_t* bits, const float* reals, double* seconds) {
   if (copy) batch = pd_copy(batch);
   Batch& b = *(Batch*)batch;
   Clocks k{seed, index, step, (u64)since};
@@ -524,16 +555,10 @@ API void* pd_run(void* batch, int copy, int64_t steps, int threads, const u64* s
   auto task = [&](int) {
     Context* c = borrow(b.g);
     c->seconds = seconds;
-    for (int n; (n = next++) < (int)b.groups.size();) run_group(*c, b, n, steps, k, planes, reals);
+    for (int n; (n = next++) < (int)b.groups.size();)
+      if (!b.rests(n)) run_group(*c, b, n, steps, k, Parameters{own != 0, bits, reals});
     put_back(c);
   };
-#if !defined(__wasm__)
-  if (count > 1) {
-    Hold hold(pool_use);
-    pool().run(count, task);
-    return batch;
-  }
-#endif
-  task(0);
+  on_threads(count, task);
   return batch;
 }

@@ -5,9 +5,8 @@ struct powder_env {
   Play play{};
   std::vector<u64> seed, index, step, masks;
   std::vector<int64_t> world, acted, episode, base, action;
-  std::vector<uint8_t> failed, waiting, begins, planes, results;
+  std::vector<uint8_t> failed, waiting, begins, results;
   std::vector<double> start, before, now, returned, sizes;
-  std::vector<float> reals;
 };
 
 // Values of the start worlds: of element ids by a table [256], or in runs of a count and a value.
@@ -21,7 +20,7 @@ template <class T> static void load_piece(void* batch, const PieceData& piece, c
 }
 static const void* start_worlds() {  // made once, and shared
   static const void* pool = [] {
-    void* batch = pd_new(WORLDS, ROWS, COLUMNS);
+    void* batch = pd_new(WORLDS, ROWS, COLUMNS, 0);
     std::vector<uint8_t> ids;
     for (const u32* run = PIECES[0].runs; ids.size() < (size_t)WORLDS * ROWS * COLUMNS; run += 2) ids.insert(ids.end(), run[0], (uint8_t)run[1]);
     for (const PieceData& piece : PIECES) {
@@ -40,7 +39,7 @@ API powder_env* powder_new(int worlds) {
   Play& p = env->play;
   describe(p);
   p.pool = start_worlds(), p.start_worlds = WORLDS;
-  p.batch = pd_new(worlds, ROWS, COLUMNS);
+  p.batch = pd_new(worlds, ROWS, COLUMNS, 0);
   auto rows = [&](auto& vector, auto*& pointer, size_t size) { vector.resize(worlds * size), pointer = vector.data(); };
   rows(env->seed, p.seed, 1), rows(env->index, p.index, 1), rows(env->step, p.step, 1);
   rows(env->world, p.world, 1), rows(env->acted, p.acted, 1), rows(env->episode, p.episode, 1), rows(env->base, p.base, 1);
@@ -50,10 +49,7 @@ API powder_env* powder_new(int worlds) {
   env->masks.assign(p.pool_masks, p.pool_masks + p.mask_words), env->sizes.assign(p.pool_sizes, p.pool_sizes + p.measures);
   if (p.own_masks) rows(env->masks, p.masks, p.mask_words), rows(env->sizes, p.sizes, p.measures);
   p.masks = env->masks.data(), p.sizes = env->sizes.data();
-  for (int i = 0; i < PARAM_PLANES; i++) env->planes.insert(env->planes.end(), worlds, PARAMETER_BITS[i]);
-  for (int i = 0; i < PARAM_REALS; i++) env->reals.insert(env->reals.end(), worlds, PARAMETER_VALUES[i]);
-  env->planes.push_back(0), env->reals.push_back(0);
-  p.param_planes = env->planes.data(), p.param_reals = env->reals.data();
+  p.param_bits = PARAMETER_BITS, p.param_reals = PARAMETER_VALUES;
   return env;
 }
 API void powder_free(powder_env* env) {

@@ -71,7 +71,8 @@ struct Play {
   // Worlds.
   void* batch;
   u64 *seed, *index, *step;
-  const uint8_t* param_planes;
+  int64_t own_params;  // whether each world has its own
+  const uint8_t* param_bits;
   const float* param_reals;
   // Episodes.
   int64_t *world, *acted, *episode;
@@ -83,12 +84,13 @@ struct Play {
   double* sizes;
   int64_t measures, mask_words, own_masks;  // whether each world has its own
   Formula each, final, success, failure;
-  // Start worlds: episode e of world i lies at i * depth + e % depth; `filled` is the first that is not there. Or
-  // `start_worlds`, if there are any: the first ones of a split, which episodes draw from as `world_seeds` does.
+  // Start worlds: episode e of world i lies at i * depth + e % depth; `filled` is the first that is not there. Or the next
+  // one of world i at `entry`, unless null. Or `start_worlds`, if there are any: the first ones of a split, which episodes
+  // draw from as `world_seeds` does.
   const void* pool;
   int64_t depth, start_worlds;
   int64_t* base;
-  const int64_t *pool_world, *filled;
+  const int64_t *entry, *pool_world, *filled;
   const double *pool_start, *pool_sizes;
   const u64* pool_masks;
   // Observations, of `size` bytes.
@@ -158,7 +160,7 @@ static void act(Play& p, Batch& b, const int64_t* actions) {
     done[PAINTED] = 0, done[PLACED] = choice >= 0, done[BLOWN] = choice == BLOW;
     chosen[i] = five[2];
     for (int axis = 0; axis < 2; axis++) speeds[axis][i] = (float)(p.speed * (double)(five[4 - axis] - 1));
-    if (choice < BLOW || p.waiting[i]) continue;
+    if (choice < BLOW || p.waiting[i] || b.is_idle(i)) continue;
     (choice < 0 ? blows : places) = true;
     int64_t* box = (choice < 0 ? blown : placed).data() + 4 * i;
     for (int axis = 0; axis < 2; axis++)
@@ -173,22 +175,23 @@ static void act(Play& p, Batch& b, const int64_t* actions) {
 template <class P> static void run_some(P& p, Batch& b, const std::vector<int>& places, int64_t steps) {
   const size_t count = places.size(), worlds = b.worlds;
   if (count == worlds) {
-    pd_run(&b, 0, steps, p.threads, p.seed, p.index, p.step, 0, p.param_planes, p.param_reals, nullptr);
+    pd_run(&b, 0, steps, p.threads, p.seed, p.index, p.step, 0, p.own_params, p.param_bits, p.param_reals, nullptr);
     for (size_t i = 0; i < worlds; i++) p.step[i] += steps;
     return;
   }
-  Batch* part = (Batch*)pd_new(count, b.g.world_height(), b.g.width);
+  Batch* part = (Batch*)pd_new(count, b.g.world_height(), b.g.width, 0);
   std::vector<u64> seed(count), index(count), step(count);
-  std::vector<uint8_t> planes(count * (PARAM_PLANES + 1));
-  std::vector<float> reals(count * (PARAM_REALS + 1));
+  std::vector<uint8_t> bits(count * PARAM_PLANES + 1);
+  std::vector<float> reals(count * PARAM_REALS + 1);
   for (size_t k = 0; k < count; k++) {
     const int i = places[k];
     copy_world(*part, k, b, i);
     seed[k] = p.seed[i], index[k] = p.index[i], step[k] = p.step[i];
-    for (size_t n = 0; n < PARAM_PLANES; n++) planes[n * count + k] = p.param_planes[n * worlds + i];
-    for (size_t n = 0; n < PARAM_REALS; n++) reals[n * count + k] = p.param_reals[n * worlds + i];
+    const size_t from = p.own_params ? i : 0;
+    std::copy_n(p.param_bits + from * PARAM_PLANES, PARAM_PLANES, &bits[k * PARAM_PLANES]);
+    std::copy_n(p.param_reals + from * PARAM_REALS, PARAM_REALS, &reals[k * PARAM_REALS]);
   }
-  pd_run(part, 0, steps, p.threads, seed.data(), index.data(), step.data(), 0, planes.data(), reals.data(), nullptr);
+  pd_run(part, 0, steps, p.threads, seed.data(), index.data(), step.data(), 0, 1, bits.data(), reals.data(), nullptr);
   for (size_t k = 0; k < count; k++) copy_world(b, places[k], *part, k), p.step[places[k]] += steps;
   pd_free(part);
 }
@@ -199,10 +202,11 @@ API int64_t pd_act(Play* play, const int64_t* actions) {
   for (int64_t i = 0; i < b.worlds * p.numbers; i++)
     if ((u64)actions[i] >= (u64)p.most[i % p.numbers]) return i;
   act(p, b, actions);
-  pd_run(&b, 0, p.steps, p.threads, p.seed, p.index, p.step, 0, p.param_planes, p.param_reals, nullptr);
+  pd_run(&b, 0, p.steps, p.threads, p.seed, p.index, p.step, 0, p.own_params, p.param_bits, p.param_reals, nullptr);
   std::vector<int> last;
   bool any_last = false;
   for (int i = 0; i < b.worlds; i++) {
+    if (b.is_idle(i)) continue;
     p.step[i] += p.steps, p.acted[i]++;
     p.action[i * ACTION_NUMBERS + TAKEN] = p.acted[i], p.action[i * ACTION_NUMBERS + LEFT] = p.actions - p.acted[i];
     any_last |= p.acted[i] >= p.actions;
@@ -264,7 +268,10 @@ static double value_of(const Play& p, const Formula& formula, int world, double*
   return *top;
 }
 static void observe(const Play& p, const Batch& b, int first, int last) {
-  show(b, lanes_of(b, first, last), p.view, p.views, p.observed, p.size);
+  for (int end; first < last; first = end) {
+    for (end = first + 1; end < last && b.is_idle(end) == b.is_idle(first);) end++;
+    if (!b.is_idle(first)) show(b, lanes_of(b, first, end), p.view, p.views, p.observed, p.size);
+  }
 }
 static int64_t drawn_world(const Play& p, int i) {  // as world_seeds of envs/tensor_env.py
   const u64 base = p.base[i];
@@ -274,10 +281,10 @@ static int64_t drawn_world(const Play& p, int i) {  // as world_seeds of envs/te
 }
 static void begin(Play& p, Batch& b, int i) {
   const int64_t episode = ++p.episode[i], n = p.measures;
-  const int64_t at = p.start_worlds ? drawn_world(p, i) : i * p.depth + episode % p.depth;
+  const int64_t at = p.start_worlds ? drawn_world(p, i) : p.entry ? p.entry[i] : i * p.depth + episode % p.depth;
   copy_world(b, i, *(const Batch*)p.pool, at);
   p.world[i] = p.seed[i] = p.start_worlds ? at : p.pool_world[at];
-  p.index[i] = p.step[i] = p.acted[i] = p.failed[i] = 0;
+  p.index[i] = p.step[i] = p.acted[i] = p.failed[i] = p.waiting[i] = 0;
   p.returned[i] = 0;
   std::copy_n(p.pool_start + at * n, n, p.start + i * n);
   std::copy_n(p.pool_start + at * n, n, p.before + i * n);
@@ -288,7 +295,8 @@ static void begin(Play& p, Batch& b, int i) {
 // The second part. Returns whether all next episodes that begin are in the pool.
 API int pd_finish(Play* play) {
   Play& p = *play;
-  const int worlds = ((Batch*)p.batch)->worlds;
+  const Batch& b = *(Batch*)p.batch;
+  const int worlds = b.worlds;
   const size_t values = worlds * p.measures;
   const Results r(p.results, worlds);
   if (!p.counted) std::copy_n(p.before, values, p.now);
@@ -296,6 +304,7 @@ API int pd_finish(Play* play) {
   bool ready = true;
   p.ended = 0;
   for (int i = 0; i < worlds; i++) {
+    if (b.is_idle(i)) continue;
     auto value = [&](const Formula& formula) { return formula.count ? value_of(p, formula, i, stack.data()) : 0.0; };
     const bool waits = p.mode == NEXT_STEP && p.waiting[i], last = p.acted[i] >= p.actions;
     bool success = value(p.success) != 0;
@@ -345,4 +354,12 @@ API int64_t pd_play(Play* play, const int64_t* actions) {
   if (!pd_finish(play)) return -2;
   pd_begin(play);
   return -1;
+}
+// Steps of the episodes of several libraries, `each_play` of one library each, on some threads.
+using EachPlay = int64_t(Play*, const int64_t*);
+API void pd_play_all(int64_t count, EachPlay* const* each_play, Play* const* plays, const int64_t* const* actions, int threads) {
+  std::atomic<int64_t> next{0};
+  on_threads((int)std::min<int64_t>(threads, count), [&](int) {
+    for (int64_t n; (n = next++) < count;) each_play[n](plays[n], actions[n]);
+  });
 }

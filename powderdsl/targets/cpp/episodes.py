@@ -38,11 +38,11 @@ class Play(ctypes.Structure):
         *_whole("numbers most column table row_edges column_edges choices"),
         *_whole("fresh_count counts_painted element element_bits speed_row speed_column fresh"),
         ("speed", ctypes.c_double),
-        *_whole("batch seed index step param_planes param_reals"),
+        *_whole("batch seed index step own_params param_bits param_reals"),
         *_whole("world acted episode failed waiting start before now returned"),
         *_whole("counts masks sizes measures mask_words own_masks"),
         *((name, Formula) for name in ("each", "final", "success", "failure")),
-        *_whole("pool depth start_worlds base pool_world filled pool_start pool_sizes pool_masks"),
+        *_whole("pool depth start_worlds base entry pool_world filled pool_start pool_sizes pool_masks"),
         *_whole("views size view observed last_observed results action begins counted ended"),
     )
 
@@ -52,5 +52,5 @@ class LevelPlay(ctypes.Structure):
 
     _fields_ = _whole(
         "threads elements places row_edges column_edges fresh_count element element_bits fresh views size line view"
-        " colors lit name batch seed index step param_planes param_reals stage elapsed chosen errors goals pictures"
+        " colors lit name batch seed index step own_params param_bits param_reals stage elapsed chosen errors goals pictures"
     )

@@ -14,7 +14,8 @@ struct LevelPlay {
   // Worlds.
   void* batch;
   u64 *seed, *index, *step;
-  const uint8_t* param_planes;
+  int64_t own_params;
+  const uint8_t* param_bits;
   const float* param_reals;
   // Episodes. `goals`: null if there are none.
   int64_t *stage, *elapsed, *chosen, *errors;

@@ -146,16 +146,16 @@ OUTLINE V draw_below(const Context& c, int stream, int y, int w, V wanted, int b
   for (; j < last && any(open); j++) compare_bit(below, open, draw_plane(c, stream, start, j), limit_bit(limit, bits, j));
   return below;
 }
-// The same with a limit given plane by plane, most significant (the carry) first.
-OUTLINE V draw_below_planes(const Context& c, int stream, int y, int w, V wanted, int bits, const V* limit) {
+// The same with a limit given bit by bit, as flags or planes, most significant (the carry) first.
+template <class T> OUTLINE V draw_below_planes(const Context& c, int stream, int y, int w, V wanted, int bits, const T* limit) {
   const Start start = draw_start(c, stream, y, w);
-  V below = wanted & limit[0], open = wanted & ~limit[0];
+  V below = wanted & words_of(limit[0]), open = wanted & ~words_of(limit[0]);
   int j = 0;
   for (; j + AHEAD <= bits && any(open); j += AHEAD) {
     const Drawn d = draw_planes(c, stream, start, j);
-    EACH_AHEAD compare_bit(below, open, d.plane[i], limit[1 + j + i]);
+    EACH_AHEAD compare_bit(below, open, d.plane[i], words_of(limit[1 + j + i]));
   }
-  for (; j < bits && any(open); j++) compare_bit(below, open, draw_plane(c, stream, start, j), limit[1 + j]);
+  for (; j < bits && any(open); j++) compare_bit(below, open, draw_plane(c, stream, start, j), words_of(limit[1 + j]));
   return below;
 }
 // The highest bit of a draw. Many masks ask for it, in several passes: it is made once a step.

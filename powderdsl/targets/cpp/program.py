@@ -75,11 +75,16 @@ def remember(key: str, code: NativeCode) -> None:
 
 
 class ParameterArrays(NamedTuple):
-    """The parameters of a batch as generated code reads them: flags uint8 [n, B], floats float32 [m, B]."""
+    """The parameters of a batch as generated code reads them: bits uint8 [B, n], floats float32 [B, m]; or [1, …]."""
 
     params: Mapping[str, Tensor]
-    planes: Tensor
+    bits: Tensor
     reals: Tensor
+
+    @property
+    def own(self) -> bool:
+        """Whether each world has parameters of its own."""
+        return len(self.bits) > 1
 
 
 class View(ctypes.Structure):
@@ -171,11 +176,11 @@ class PackedState(OwnedBatch):
                 self.program.library.pd_fill(changed.handle, slot, bits, numbers.data_ptr(), boxes.data_ptr())
         return changed
 
-    def select(self, places: Tensor) -> PackedState:
-        """The worlds `places`, int64 [n], as a new state."""
+    def select(self, places: Tensor, running: int = 0) -> PackedState:
+        """The worlds `places`, int64 [n], as a new state. `running`: see `NativeProgram.pack`."""
         rows, library, places = len(places), self.program.library, places.contiguous()
         like = {name: (dtype, (rows, *shape[1:])) for name, (dtype, shape) in self.like.items()}
-        taken = PackedState(self.program, library.pd_new(rows, *shape_of(self)[1:]), like)
+        taken = PackedState(self.program, library.pd_new(rows, *shape_of(self)[1:], running), like)
         library.pd_take(taken.handle, None, self.handle, places.data_ptr(), rows)
         return taken
 
@@ -226,7 +231,7 @@ class NativeProgram(Places):
         seconds = None if job.timing is None else (ctypes.c_double * len(self.code.passes))()
         handle = self.library.pd_run(
             handle, not reuse, job.steps, self.threads,
-            seed.data_ptr(), index.data_ptr(), start.data_ptr(), since, inputs.planes.data_ptr(), inputs.reals.data_ptr(), seconds,
+            seed.data_ptr(), index.data_ptr(), start.data_ptr(), since, inputs.own, inputs.bits.data_ptr(), inputs.reals.data_ptr(), seconds,
         )  # fmt: skip
         if job.timing is not None and seconds is not None:
             for name, spent in zip(self.code.passes, seconds, strict=True):
@@ -239,15 +244,20 @@ class NativeProgram(Places):
             return known
         if len(self._inputs) >= KEPT_INPUTS:
             self._inputs = {}  # not cleared: another thread may be reading it
-        bits, floats = self.layout.parameters(torch, params, batch)
-        self._inputs[id(params)] = inputs = ParameterArrays(params, bits, floats)
+        bits, floats = (part.T for part in self.layout.parameters(torch, params, batch))
+        if bool((bits == bits[:1]).all()) and bool((floats == floats[:1]).all()):
+            bits, floats = bits[:1], floats[:1]
+        self._inputs[id(params)] = inputs = ParameterArrays(params, bits.contiguous(), floats.contiguous())
         return inputs
 
-    def pack(self, state: Mapping[str, Tensor]) -> PackedState:
-        """A state in this program's memory: the argument, if it already is."""
+    def pack(self, state: Mapping[str, Tensor], running: int = 0) -> PackedState:
+        """A state in this program's memory: the argument, if it already is.
+
+        `running` returns a new state, laid out for about this number of worlds that are not idle.
+        """
         if isinstance(state, PackedState) and state.program is self:
-            return state
-        handle: int = self.library.pd_new(*shape_of(state))
+            return state.select(torch.arange(shape_of(state)[0]), running) if running else state
+        handle: int = self.library.pd_new(*shape_of(state), running)
         for name, value in state.items():
             if not any(value.stride(axis) for axis in (0, -2, -1)) and not value[0, ..., 0, 0].any():
                 continue  # 0 in all cells, as in a new batch

@@ -54,7 +54,7 @@ struct Context {
   V* coins[COINS + 1];      // planes
   bool tossed[COINS + 1];  // whether this step has filled them
   V step_bits[STEP_PLANES + 1];
-  V param_bits[PARAM_PLANES + 1];
+  Flags param_bits[PARAM_PLANES + 1];
   float param_real[PARAM_REALS + 1][LANES];
   Plane* slot[SLOTS + 1];
   Field* real[REALS + 1];

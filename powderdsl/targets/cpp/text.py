@@ -266,7 +266,7 @@ class _Words(WordText):
             case "const":
                 return "valid" if attr else "splat(0)"
             case "param":
-                return f"c.param_bits[{self.layout.param_planes[param_key(node)]}]"
+                return f"words_of(c.param_bits[{self.layout.param_planes[param_key(node)]}])"
             case "coordinate" if attr[0] == "step":
                 return f"c.step_bits[{self.layout.step_planes[attr[1:]]}]"
             case "coordinate" | "inside":

@@ -106,6 +106,28 @@ ALWAYS u32 lanes_of(V a) {  // a bit for each world that has any
   return some;
 #endif
 }
+// A flag for each lane, as a word of all its bits: one bit each in memory if the processor widens them at no cost.
+#if VECTOR == 64
+typedef u32 Flags;
+ALWAYS Flags flags_of(int first, int end) { return (Flags)((1ull << end) - (1ull << first)); }
+ALWAYS V words_of(Flags flags) {
+#if WIDTH == 16
+  return (V)_mm512_maskz_set1_epi16(flags, -1);
+#elif WIDTH == 32
+  return (V)_mm512_maskz_set1_epi32((__mmask16)flags, -1);
+#else
+  return (V)_mm512_maskz_set1_epi64((__mmask8)flags, -1);
+#endif
+}
+#else
+typedef V Flags;
+ALWAYS Flags flags_of(int first, int end) {
+  V flags = V{};
+  for (int l = first; l < end; l++) flags[l] = FULL;
+  return flags;
+}
+#endif
+ALWAYS V words_of(V flags) { return flags; }
 ALWAYS bool any_word(const V* row, int words) {
   V some = row[0];
   for (int w = 1; w < words; w++) some |= row[w];

@@ -389,6 +389,7 @@ static void count_cells(const Batch& b, const Counts& c, const u64* masks, int64
   for (int i = 0; i < b.worlds; i++)
     for (int k = 0; k < c.counts; k++) values[(size_t)i * c.numbers + c.count[k].number] = 0;
   for (int n = 0; n < (int)b.groups.size(); n++) {
+    if (b.rests(n)) continue;
     std::fill(total.begin(), total.end(), 0);
     for (int i = first * g.words; i < last * g.words; i++) {
       const int y = i / g.words, w = i % g.words;
