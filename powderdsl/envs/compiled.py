@@ -218,14 +218,15 @@ class Stepper(Plan):
         self.prepare()
         self.native.library.pd_rest(self.play.batch, idle.ctypes.data)
 
-    def enter(self, ahead: Episodes, places: Tensor, rows: Tensor) -> None:
+    def enter(self, ahead: Episodes, places: Any, rows: Any) -> None:
         """Begin the episodes `places` of `ahead` in some rows, int64 [n] each, and write observations."""
-        self._draw_from(ahead)
-        self._entry = torch.zeros(len(self.begins), dtype=torch.int64)
-        self._entry[rows], self.begins[rows] = places, True
-        self.play.entry = self._entry.data_ptr()
+        if ahead is not self._ahead:
+            self._draw_from(ahead)
+        entry, begins = np.zeros(len(self.begins), np.int64), self.begins.numpy()
+        entry[rows], begins[rows] = places, True
+        self._entry, self.play.entry = torch.from_numpy(entry), entry.ctypes.data
         self.begin()
-        self.begins.zero_()
+        begins[rows] = False
 
     def begin(self) -> None:
         """Begin the next episodes where `begins` is set, and write observations."""

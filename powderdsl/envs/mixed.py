@@ -267,7 +267,7 @@ class MixedEnv(CompiledEnv):
         for number, rows, worlds in entering:
             stepper, (ahead, entries) = groups[number][0]._stepper, self._starts(number, worlds)
             assert stepper is not None
-            stepper.enter(ahead, entries, torch.from_numpy(rows))
+            stepper.enter(ahead, entries, rows)
         episodes = MixedEpisodes([*groups.values()])
         self._order = episodes.order.numpy()
         if self.observation.kind == "laws":
