@@ -141,10 +141,12 @@ class MixedEnv(CompiledEnv):
         self._most = np.array(self.action_nvec, np.uint64)
         self._envs: dict[int, CompiledEnv] = {}
         self._groups: Groups = {}
-        self._ahead: dict[int, tuple[dict[int, int], Episodes]] = {}
-        """By ruleset: start worlds made ahead, and the place of each world's number in them."""
-        self._ahead_from: tuple[Tensor, Tensor] | None = None
-        """The seeds of the environments, and the first episodes whose worlds were made ahead: int64 [B]."""
+        self._planned: dict[int, Tensor] = {}
+        """By ruleset: the ascending numbers of worlds that will be needed, int64 [n]."""
+        self._ahead: dict[int, Episodes] = {}
+        """The starts of planned worlds, by ruleset."""
+        self._planned_from: tuple[Tensor, Tensor] | None = None
+        """The seeds of the environments, and the first episodes whose worlds were planned: int64 [B]."""
 
     def _env(self, number: int) -> CompiledEnv:
         """The environment of the episodes under a ruleset."""
@@ -226,26 +228,27 @@ class MixedEnv(CompiledEnv):
         return members
 
     def _starts(self, number: int, worlds: Tensor) -> tuple[Episodes, Tensor]:
-        """Return starts of episodes under a ruleset, and the places among them of worlds, int64 [n]."""
-        env, (places, ahead) = self._env(number), self._ahead.get(number, ({}, None))
-        rows = [places.get(world, -1) for world in worlds.tolist()]
-        if ahead is None or -1 in rows:
-            return env.program.start(worlds, env.simulator.native(self.task.size[1])), torch.arange(len(rows))
-        return ahead, torch.tensor(rows)
+        """Return starts of episodes under a ruleset, and the places among them of worlds, int64 [n].
 
-    def _make_ahead(self, base: Tensor, first: Tensor, depth: int) -> None:
-        """Make start worlds of `depth` episodes from `first`, int64 [B], on, under the rulesets in use.
-
-        A batch of many worlds takes little longer than one of a few.
+        If they are planned, these are all planned worlds: a batch of many takes little longer than one of a few.
         """
+        env, planned = self._env(number), self._planned.get(number, worlds[:0])
+        native = env.simulator.native(self.task.size[1])
+        if not bool(torch.isin(worlds, planned).all()):
+            return env.program.start(worlds, native), torch.arange(len(worlds))
+        if number not in self._ahead:
+            self._ahead[number] = env.program.start(planned, native)
+        return self._ahead[number], torch.searchsorted(planned, worlds)
+
+    def _plan(self, base: Tensor, first: Tensor, depth: int) -> None:
+        """Plan the start worlds of `depth` episodes from `first`, int64 [B], on."""
         episodes = first + torch.arange(depth)[:, None]
         worlds = self._choose(base.expand_as(episodes).flatten(), episodes.flatten()).unique()
-        rulesets, self._ahead, self._ahead_from = self.program.ruleset_of(worlds), {}, (base, first)
-        for number, env in self._envs.items():
-            own = worlds[rulesets == number]
-            if len(own):
-                places = {world: place for place, world in enumerate(own.tolist())}
-                self._ahead[number] = places, env.program.start(own, env.simulator.native(self.task.size[1]))
+        rulesets = self.program.ruleset_of(worlds)
+        numbers, counts = rulesets.unique(return_counts=True)
+        parts = worlds[rulesets.argsort(stable=True)].split(counts.tolist())
+        self._planned, self._ahead = dict(zip(numbers.tolist(), parts, strict=True)), {}
+        self._planned_from = base, first
 
     def _regroup(self, groups: Groups, entering: Sequence[tuple[int, Array, Tensor]] = ()) -> Episodes:
         """Continue with these groups. Returns their episodes.
@@ -351,10 +354,10 @@ class MixedEnv(CompiledEnv):
         self._returned = self._returned.masked_fill(mask, 0)
         depth = 2 * episodes_ahead(self.num_envs, self.task.size)  # more, since batches are small
         if self.curriculum is None:
-            base, first = self._ahead_from or (None, self._episode)
+            base, first = self._planned_from or (None, self._episode)
             passed = (self._episode - first)[rows]
             if base is not self._base or not bool(((passed >= 0) & (passed < depth)).all()):
-                self._make_ahead(self._base, self._episode + ~mask, depth)
+                self._plan(self._base, self._episode + ~mask, depth)
         worlds = torch.zeros_like(self._episode)
         worlds[rows] = self._choose(self._base[rows], self._episode[rows])
         self._restart(mask, worlds)
