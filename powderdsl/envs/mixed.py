@@ -352,7 +352,7 @@ class MixedEnv(CompiledEnv):
         assert self._base is not None
         self._episode, rows = self._episode + mask, mask.nonzero()[:, 0]
         self._returned = self._returned.masked_fill(mask, 0)
-        depth = 2 * episodes_ahead(self.num_envs, self.task.size)  # more, since batches are small
+        depth = min(len(self.program.rulesets), 2) * episodes_ahead(self.num_envs, self.task.size)
         if self.curriculum is None:
             base, first = self._planned_from or (None, self._episode)
             passed = (self._episode - first)[rows]
