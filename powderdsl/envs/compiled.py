@@ -46,7 +46,7 @@ Steps = tuple[Any, Any, Any, Any, dict[str, Any]]
 
 
 def side_by_side(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """Return contiguous copies of tensors in one memory, since few worlds fit into one cache line each."""
+    """Return contiguous copies of tensors, one after another in memory, so that those of few worlds share cache lines."""
     sizes = [-(-tensor.nbytes // 8) * 8 for tensor in tensors.values()]
     parts = torch.empty(sum(sizes), dtype=torch.uint8).split(sizes)
     return {
@@ -269,8 +269,8 @@ class Stepper(Plan):
                 drawn[rows] = self._ahead.params[name][places]
             for name, value in (params_of(self.episodes, self._overrides) or {}).items():
                 self._params[name].copy_(value)
-            own = {name: value[rows] for name, value in self._params.items()}
-            parts = self.native.layout.parameters(torch, own, len(rows))
+            own_params = {name: value[rows] for name, value in self._params.items()}
+            parts = self.native.layout.parameters(torch, own_params, len(rows))
             self._inputs.bits[rows], self._inputs.reals[rows] = (part.T for part in parts)
 
     def fill(self, numbers: Callable[[Tensor, Tensor], Tensor]) -> None:

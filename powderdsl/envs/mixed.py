@@ -34,7 +34,7 @@ def environment(task: str | Path | Task | TaskProgram, num_envs: int = 1, **how:
 
 
 MOST_ROWS = 4
-"""Maximum number of rows, for each environment, that are kept for later episodes."""
+"""Maximum number of rows per environment, including idle ones."""
 
 COLUMNS = ("observed", "reward", "terminated", "truncated", "success", "episode_return", "episode_length")
 """The results of a step, one row per episode: names of `Results`."""
@@ -74,12 +74,13 @@ class Joint:
         bound = [stepper.episodes for stepper in steppers]
         return len(bound) == len(self._bound) and all(map(operator.is_, bound, self._bound))
 
-    def seat(self, members: Sequence[Array]) -> None:
-        """Continue with the episodes of these numbers in the rows of each stepper, int64 [n]; −1: the row is idle."""
-        numbers = np.concatenate(members)
-        self.rows = np.argsort(numbers, kind="stable")[np.count_nonzero(numbers < 0) :]
-        """The row of each episode: int64 [B]."""
-        self._places = [(values, places[self.rows]) for values, places in self._columns]
+    def seat(self, members: Sequence[Array], rows: Array) -> None:
+        """Continue with the episodes of these numbers in the rows of each stepper, int64 [n]; −1: the row is idle.
+
+        `rows`: the row of each episode, int64 [B].
+        """
+        self.rows = rows
+        self._places = [(values, places[rows]) for values, places in self._columns]
         busy = np.array([bool((own >= 0).any()) for own in members])
         threads = self._steppers[0].native.threads
         self._threads = threads if busy.sum() >= threads else 1
@@ -265,14 +266,15 @@ class MixedEnv(CompiledEnv):
         elif self._joint is None or not self._joint.has(ready):
             space = self.observation.space
             self._joint = Joint(ready, space.shape, space.dtype)
+        numbers = np.concatenate(members)
+        self._order = np.argsort(numbers, kind="stable")[np.count_nonzero(numbers < 0) :]
         if self._joint is not None:
-            self._joint.seat(members)
+            self._joint.seat(members, self._order)
         for number, rows, worlds in entering:
             stepper, (ahead, entries) = groups[number][0]._stepper, self._starts(number, worlds)
             assert stepper is not None
             stepper.enter(ahead, entries, rows)
-        episodes = MixedEpisodes([*groups.values()])
-        self._order = episodes.order.numpy()
+        episodes = MixedEpisodes([env for env, _ in groups.values()], torch.from_numpy(self._order))
         if self.observation.kind == "laws":
             self._laws = episodes.joined(TaskProgram.law_bytes).numpy()
         return episodes  # type: ignore[return-value]  # same attributes
@@ -363,7 +365,7 @@ class MixedEnv(CompiledEnv):
         self._restart(mask, worlds)
         begun = mask.numpy()
         if self._joint is not None:
-            shown = self._joint.observed[self._joint.rows[begun]]
+            shown = self._joint.observed[self._order[begun]]
             if self.observation.kind == "laws":
                 self._write_own(shown, begun)
             observed[begun] = shown

@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any, Protocol
+from typing import Protocol
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from powderdsl.simulation.simulator import World
 from powderdsl.tasks.episodes import Episodes, TaskProgram
-
-Array = np.ndarray[Any, Any]
 
 
 class Playing(Protocol):
@@ -42,14 +39,12 @@ class MixedEpisodes:
     """The current episodes of environments in one order, read-only.
 
     Args:
-        groups: environments, and the numbers of their episodes, int64 [n]; −1: not one of them.
+        envs: environments.
+        order: the place of each episode among those of all environments, int64 [B].
     """
 
-    def __init__(self, groups: Sequence[tuple[Playing, Array]]):
-        self._envs = [env for env, _ in groups]
-        numbers = np.concatenate([rows for _, rows in groups])
-        self.order = torch.from_numpy(np.argsort(numbers, kind="stable")[np.count_nonzero(numbers < 0) :])
-        """The place of each episode in the groups, one after another: int64 [B]."""
+    def __init__(self, envs: Sequence[Playing], order: Tensor):
+        self._envs, self.order = envs, order
         self.seed = self.joined(lambda program, episodes: episodes.seed)
         """The numbers of their start worlds, int64 [B]."""
 

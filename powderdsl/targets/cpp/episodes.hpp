@@ -355,11 +355,11 @@ API int64_t pd_play(Play* play, const int64_t* actions) {
   pd_begin(play);
   return -1;
 }
-// Steps of the episodes of several libraries, `each_play` of one library each, on some threads.
-using EachPlay = int64_t(Play*, const int64_t*);
-API void pd_play_all(int64_t count, EachPlay* const* each_play, Play* const* plays, const int64_t* const* actions, int threads) {
+// Steps of the episodes of several libraries on some threads; `functions`: pd_play of each library.
+using PlayFunction = int64_t(Play*, const int64_t*);
+API void pd_play_all(int64_t count, PlayFunction* const* functions, Play* const* plays, const int64_t* const* actions, int threads) {
   std::atomic<int64_t> next{0};
   on_threads((int)std::min<int64_t>(threads, count), [&](int) {
-    for (int64_t n; (n = next++) < count;) each_play[n](plays[n], actions[n]);
+    for (int64_t n; (n = next++) < count;) functions[n](plays[n], actions[n]);
   });
 }

@@ -83,7 +83,7 @@ class ParameterArrays(NamedTuple):
 
     @property
     def own(self) -> bool:
-        """Whether each world has parameters of its own."""
+        """True if each world has parameters of its own."""
         return len(self.bits) > 1
 
 

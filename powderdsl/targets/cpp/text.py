@@ -55,11 +55,11 @@ def pass_text(schedule: Schedule, number: int, layout: NativeLayout) -> str:
     inputs, stored = dict(schedule.inputs), set()
     for slot, node in schedule.outputs:
         var = Var(storage_of(node), node.type)
-        place, is_last = printer.slot(slot, var), node.op == "load" and var.name not in stored
+        place, moves = printer.slot(slot, var), node.op == "load" and var.name not in stored
         stored.add(var.name)
         if slot not in inputs:
             lines.append(f"give(c, {place});")
-        lines.append(f"{place} = {var.name if is_last else f'keep({var.name})'};")
+        lines.append(f"{place} = {var.name if moves else f'keep({var.name})'};")
     return "\n".join([*lines, "}"])
 
 

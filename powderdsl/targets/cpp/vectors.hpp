@@ -106,7 +106,7 @@ ALWAYS u32 lanes_of(V a) {  // a bit for each world that has any
   return some;
 #endif
 }
-// A flag for each lane, as a word of all its bits: one bit each in memory if the processor widens them at no cost.
+// A flag for each lane, as a word of all its bits: one bit each in memory if the processor has masks.
 #if VECTOR == 64
 typedef u32 Flags;
 ALWAYS Flags flags_of(int first, int end) { return (Flags)((1ull << end) - (1ull << first)); }
