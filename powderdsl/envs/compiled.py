@@ -236,9 +236,13 @@ class Stepper(Plan):
 
     def prepare(self) -> None:
         """Let the library write to the worlds. Raises RuntimeError if they were stepped with `reuse`."""
-        state: PackedState = self.episodes.world.state  # type: ignore[assignment]
-        self.play.batch = state.handle
-        state.forget()
+        self.state.forget()
+        self.play.batch = self.state.handle
+
+    @property
+    def state(self) -> PackedState:
+        """The state of its worlds."""
+        return self.episodes.world.state  # type: ignore[return-value]
 
     @property
     def call(self) -> tuple[int, int, int]:

@@ -87,6 +87,7 @@ class Joint:
         for stepper, own in zip(self._steppers, members, strict=True):
             stepper.rest(own < 0)
             stepper.play.threads = threads // self._threads
+        self._states = [stepper.state for stepper in self._steppers]
         together = busy & [not stepper.measures_cells for stepper in self._steppers]
         self._together = np.ascontiguousarray(self._calls[together].T)
         self._apart = [self._steppers[int(place)] for place in np.flatnonzero(busy & ~together)]
@@ -94,8 +95,8 @@ class Joint:
     def step(self, actions: Array) -> list[Array]:
         """Step all episodes: the columns of `COLUMNS`, in the order of their numbers."""
         self._numbers[self.rows] = actions.reshape(len(self.rows), -1)
-        for stepper in self._steppers:
-            stepper.prepare()
+        for state in self._states:  # faster than `prepare`, which `seat` has called
+            state.forget()
         addresses = [row.ctypes.data for row in self._together]
         self._steppers[0].native.library.pd_play_all(self._together.shape[1], *addresses, self._threads)
         for stepper in self._apart:
