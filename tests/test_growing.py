@@ -108,7 +108,7 @@ for _ in range(3):
 for result in results:
     assert torch.equal(result["n"].int(), wanted["n"])
     assert torch.equal(result["x"], wanted["x"])
-assert "magnitude(" in native_source(part.planes, 64).text
+assert "magnitude(" in native_source(part.planes, 64).passes
 assert "MAGNITUDE(" in cuda_source(part.planes, 16, 16, 1 << 16).text
 """
 

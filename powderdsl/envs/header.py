@@ -59,7 +59,7 @@ def c_environment(env: TensorEnv, worlds: int, name: str) -> CEnvironment:
         helps = ("`powderdsl show TASK --cost` names them",)
         raise failure("PD702", "bit planes do not show all measures of this task", helps=helps)
     episodes = env.program.start(torch.arange(worlds))
-    lines = [code.text, *_tables(env, plan, places, episodes), _text("environment.hpp")]
+    lines = [code.whole, *_tables(env, plan, places, episodes), _text("environment.hpp")]
     values = ", ".join(map(str, env.action_form.nvec))
     constants = {
         "ROWS": size[0],

@@ -112,10 +112,11 @@ def add(folder: Path, key: str, code: bytes, name: str) -> Path:
     The key is hexadecimal digits, the name for `powderdsl cache list`. Raises OSError if it cannot be written.
     """
     (home := folder / key[:2]).mkdir(mode=0o700, exist_ok=True)
-    for path in sorted(home.glob(f"{key}-*")):
-        path.unlink(missing_ok=True)  # damaged, or from another process that was as fast
     name = re.sub(r"[^\w.+]", "_", name)[:80] or "?"
     path = home / f"{key}-{hashlib.sha256(code).hexdigest()}-{name}"
+    for other in sorted(home.glob(f"{key}-*")):
+        if other != path:  # which another process may have added, and load now
+            other.unlink(missing_ok=True)
     with scratch_folder(folder) as scratch:
         (scratch / "code").write_bytes(code)
         os.replace(scratch / "code", path)

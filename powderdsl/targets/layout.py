@@ -109,8 +109,6 @@ class NativeLayout(Layout):
     """Planes that such a loop tests."""
     reach: int = 1
     """Distance in columns beyond the edges at which a row of floats is read."""
-    real_rows: int = 1
-    """Distance in rows at which floats are read."""
     halo: int = 16
     """Rows and columns beyond the grid for which tables and rows of floats have room."""
     around_rows: int = 0

@@ -283,8 +283,8 @@ def test_auto_changes_over_to_the_same_worlds_and_remembers(
 
 
 def libraries(folder: Path) -> list[Path]:
-    """The libraries in a cache, which are not the starts of programs."""
-    return [entry.path for entry in cache.entries(folder) if not entry.name.endswith(".layout")]
+    """The libraries of programs in a cache, without those of drivers and the starts of programs."""
+    return [entry.path for entry in cache.entries(folder) if not entry.name.endswith((".layout", "driver"))]
 
 
 def compiled_natively(rules: Ruleset) -> None:

@@ -26,6 +26,7 @@ from powderdsl.targets.cpp.build import (
     Building,
     Compiler,
     NoCompiler,
+    Source,
     build,
     building,
     find_compiler,
@@ -155,7 +156,7 @@ def test_each_compiler_gets_flags_that_it_takes(
     compiler = find_compiler()
     assert (compiler.family, compiler.version) == (family, version)
     with building(Building("-O1", tmp_path)):
-        library = build("// source\n", "yard")
+        (library,) = build(Source("// source\n", "yard"))
     assert library.read_text() == "// source\n"
     (call,) = calls(tmp_path)
     flags = set(call.split())
@@ -219,7 +220,10 @@ def test_another_compiler_source_or_level_is_another_library(
         monkeypatch.setenv("CXX", str(fake(tmp_path, f"cc{version[-1]}", version)))
         for level in ("-O1", "-O2"):
             with building(Building(level, tmp_path)):
-                libraries |= {build("// a\n"), build("// b\n"), build("// a\n")}
+                libraries |= {
+                    *build(*(Source(f"// {name}\n", name) for name in "ab")),
+                    *build(Source("// a\n", "a")),
+                }
     assert len(libraries) == len(calls(tmp_path)) == 8
 
 
@@ -228,12 +232,13 @@ def test_units_are_compiled_side_by_side(tmp_path: Path, monkeypatch: pytest.Mon
     both = f"echo x >> {tmp_path}/there; while [ $(wc -l < {tmp_path}/there) = 1 ]; do sleep 0.1; done"
     monkeypatch.setenv("CXX", str(fake(tmp_path, "cc", "g++ 1", f'{both}; cp "${{@: -1}}" "$out"')))
     with building(Building("-O0", tmp_path)):
-        assert build("// source\n", "yard", units=2).read_text() == "// source\n"
+        (library,) = build(Source("// source\n", "yard", units=2))
+        assert library.read_text() == "// source\n"
         found = calls(tmp_path)
         assert sorted(re.findall("-DUNIT=.", " ".join(found))) == ["-DUNIT=0", "-DUNIT=1"]
         assert " -c " not in found[2]
         monkeypatch.setattr("os.cpu_count", lambda: 1)
-        build("// other\n", "yard", units=2)
+        build(Source("// other\n", "yard", units=2))
         assert len(calls(tmp_path)) == 4
 
 
@@ -241,7 +246,7 @@ def test_a_compiler_that_fails_is_quoted(tmp_path: Path, monkeypatch: pytest.Mon
     body = "echo program.cpp:1: bad >&2; exit 3"
     monkeypatch.setenv("CXX", str(fake(tmp_path, "cc", "g++ 1", body)))
     with building(Building("-O0", tmp_path)), pytest.raises(NoCompiler, match=r"failed:\nprogram.cpp:1: bad"):
-        build("// source\n")
+        build(Source("// source\n", "yard"))
     assert not [name for name in names(tmp_path) if MARK in name]
 
 
@@ -250,9 +255,9 @@ def test_a_compiler_that_fails_is_quoted(tmp_path: Path, monkeypatch: pytest.Mon
 BUILD = """
 import sys
 from pathlib import Path
-from powderdsl.targets.cpp.build import Building, build, building
+from powderdsl.targets.cpp.build import Building, Source, build, building
 with building(Building("-O0", Path(sys.argv[1]))):
-    print(build("// source\\n", "yard").read_text())
+    print(build(Source("// source\\n", "yard"))[0].read_text())
 """
 
 

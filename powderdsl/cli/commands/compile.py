@@ -125,7 +125,7 @@ def _kernels(program: Program, backend: str, pass_name: str | None) -> Iterator[
         elif backend == "native":
             from powderdsl.targets.cpp.source import native_source
 
-            yield native_source(part.planes).text
+            yield native_source(part.planes).passes
         elif backend == "cuda":
             from powderdsl.targets.cuda.source import cuda_source
 

@@ -12,7 +12,7 @@ import shlex
 import shutil
 import signal
 import subprocess
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from contextvars import ContextVar
 from dataclasses import dataclass
@@ -20,6 +20,7 @@ from functools import lru_cache
 from importlib.util import find_spec
 from pathlib import Path
 from tempfile import TemporaryFile
+from typing import NamedTuple
 
 # Imported here, not later: a fork while another thread imports it would leave the child waiting forever.
 from filelock import FileLock, Timeout
@@ -194,42 +195,59 @@ def cache_key(source: str, compiler: Compiler, flags: tuple[str, ...]) -> str:
     return hashlib.sha256("\0".join(parts).encode()).hexdigest()[:32]
 
 
-def build(source: str, ruleset: str = "", units: int = 1) -> Path:
-    """The path of the library for a source, compiled unless it is in the cache.
+class Source(NamedTuple):
+    """The text of a library, and a name for `powderdsl cache list`. Its `units` are selected by UNIT."""
 
-    Safe with other processes and threads that do the same: one of them compiles, and the library is added atomically. A
-    damaged library is compiled again. `powderdsl cache list` shows the name `ruleset`. `units` parts of the source,
-    selected by UNIT, are compiled side by side. Raises NoCompiler if none was found, or it failed.
+    text: str
+    name: str
+    units: int = 1
+
+
+def build(*sources: Source) -> list[Path]:
+    """The paths of the libraries of sources, compiled side by side unless they are in the cache.
+
+    Safe with other processes and threads that do the same: one of them compiles the first source, and libraries are added
+    atomically. Damaged libraries are compiled again. Raises NoCompiler if none was found, or it failed.
     """
     compiler, how = find_compiler(), current()
     flags, folder = flags_for(compiler, how.level), how.place()
-    key = cache_key(source, compiler, flags)
-    if library := cache.find(folder, key):
-        return library
-    with turn(folder, key):
-        if library := cache.find(folder, key):
-            return library
-        try:
-            code = _compile([*compiler.command, *flags], source, units, folder)
-            return cache.add(folder, key, code, ruleset)
-        except OSError as error:
-            raise NoCompiler(f"no room for compiled code: {error}") from None
+    keys = {cache_key(source.text, compiler, flags): source for source in sources}
+    paths = {key: cache.find(folder, key) for key in keys}
+    if None in paths.values():
+        with turn(folder, next(iter(keys))):
+            paths = {key: cache.find(folder, key) for key in keys}
+            new = [key for key, path in paths.items() if path is None]
+            try:
+                codes = _compile([*compiler.command, *flags], [keys[key] for key in new], folder)
+                for key, code in zip(new, codes, strict=True):
+                    paths[key] = cache.add(folder, key, code, keys[key].name)
+            except OSError as error:
+                raise NoCompiler(f"no room for compiled code: {error}") from None
+    return [path for path in paths.values() if path is not None]
 
 
-def _compile(command: list[str], source: str, units: int, folder: Path) -> bytes:
-    """The library of a source; its units are compiled side by side on a machine with several processors."""
+def _compile(command: list[str], sources: Sequence[Source], folder: Path) -> list[bytes]:
+    """The libraries of sources; all units are compiled side by side."""
     with scratch_folder(folder) as scratch:
-        text, library = scratch / "program.cpp", scratch / "library"
-        text.write_text(source, encoding="utf-8")
-        inputs, rounds = [str(text)], []
-        if units > 1 and os.cpu_count() != 1:
-            inputs = [str(scratch / f"{unit}.o") for unit in range(units)]
-            rounds = [[[*command, "-c", f"-DUNIT={i}", "-o", o, str(text)] for i, o in enumerate(inputs)]]
-        for commands in (*rounds, [[*command, "-o", str(library), *inputs]]):
+        compilers, linkers, libraries = [], [], []
+        for number, (text, _, units) in enumerate(sources):
+            (home := scratch / f"{number}").mkdir()
+            library, file = home / "library", home / "program.cpp"  # whose name is in the library
+            libraries.append(library)
+            file.write_text(text, encoding="utf-8")
+            if units == 1 or os.cpu_count() == 1:
+                compilers.append([*command, "-o", str(library), str(file)])
+                continue
+            objects = [f"{library}-{unit}.o" for unit in range(units)]
+            compilers += [
+                [*command, "-c", f"-DUNIT={unit}", "-o", o, str(file)] for unit, o in enumerate(objects)
+            ]
+            linkers.append([*command, "-o", str(library), *objects])
+        for commands in (compilers, linkers):
             status, messages = run_compilers(scratch, *commands)
             if status:
                 raise NoCompiler("\n".join([f"{command[0]} failed:", *messages.splitlines()[:8]]))
-        return library.read_bytes()
+        return [library.read_bytes() for library in libraries]
 
 
 def run_compilers(scratch: Path, *commands: list[str]) -> tuple[int, str]:
@@ -278,7 +296,9 @@ atexit.register(_end, _running)
 _TYPES = {"p": ctypes.c_void_p, "i": ctypes.c_int, "l": ctypes.c_int64, "f": ctypes.c_float, "-": None}
 
 SIGNATURES = {
-    "pd_new": "p iiii",
+    "pd_program": "p p",
+    "pd_shared": "p",
+    "pd_new": "p piiii",
     "pd_rest": "- pp",
     "pd_free": "- p",
     "pd_copy": "p p",
@@ -298,7 +318,7 @@ SIGNATURES = {
     "pd_choose": "- ppp",
     "pd_observe": "- ppi",
 }
-"""The result and the arguments of each function of a library, by letters of `_TYPES`."""
+"""The result and the arguments of the function of a program's library, and those of its driver's, by letters of `_TYPES`."""
 
 
 @lru_cache(maxsize=64)
@@ -309,7 +329,7 @@ def load_library(path: Path) -> ctypes.CDLL:
     except OSError as error:
         raise NoCompiler(f"compiled code cannot be loaded: {error}") from None
     for name, signature in SIGNATURES.items():
-        function = getattr(library, name)
-        result, arguments = signature.split()
-        function.restype, function.argtypes = _TYPES[result], [_TYPES[letter] for letter in arguments]
+        if function := getattr(library, name, None):
+            result, _, arguments = signature.partition(" ")
+            function.restype, function.argtypes = _TYPES[result], [_TYPES[letter] for letter in arguments]
     return library

@@ -200,10 +200,10 @@ class _Loop(CellValues[str]):
         for name in self.fields:
             if self.is_bare(name):
                 bare = self.rows.rings[name].bare
-                yield f"bare_row<{bare}>(c, o{name});" if bare else ""
+                yield f"bare_row<{bare}>(c.g, o{name});" if bare else ""
             else:
                 reach = self.rows.reaches.get(name, 0)
-                yield f"finish_row<{'REACH' if reach == ANY_PASS else reach}>(c, o{name});"
+                yield f"finish_row<{'REACH' if reach == ANY_PASS else reach}>(c.g, o{name});"
 
     def row_outside_region(self) -> Iterator[str]:
         for name, value in self.loop.olds.items():
@@ -292,7 +292,7 @@ class _Loop(CellValues[str]):
         yield " ".join(map("some{0} |= v{0}.live[base + y] = some;".format, names))
         yield f"if (!some) {{ {self.forget_rings()} }} else {{"
         yield " ".join(self.starts())
-        yield f"for (int w = 0; w < words; w++) {{ const Word* masks = turned + w * c.masks; const u64 which = which_turned(masks, {count});"
+        yield f"for (int w = 0; w < words; w++) {{ const Word* masks = turned + w * TURNED; const u64 which = which_turned(masks, {count});"
         yield " ".join(f"F g{number}[BITS / CHUNK];" for number in range(len(chains)))
         loads = (f"{head} = load({old}, x);" for head, old in zip(heads, olds_at, strict=True))
         yield f"EACH_REGISTER {{ {' '.join(loads)} }}"
@@ -314,7 +314,6 @@ class _Loop(CellValues[str]):
         return name in self.rows.rings and self.rows.rings[name].bare is not None
 
     def row(self, field: str, dy: int, *, wraps: bool = True) -> str:
-        self.layout.cover(real_rows=abs(dy))
         field = self.rows.places.get(field, field)
         if field in self.rows.rings:
             call = self.at(field, dy)

@@ -1,15 +1,18 @@
-// Batches of worlds, packing, threads and the entry points. Comes after the generated passes.
+// Batches of worlds, packing, threads and the entry points. Comes after movements.hpp and draws.hpp.
 #include <unistd.h>
 
 struct Group {
-  Plane* slot[SLOTS + 1];
-  Field* real[REALS + 1];
+  Plane** slot;
+  Field** real;
   u64 present;  // as in a context, after the last run; not known where planes have been written to since
 };
 struct Batch {
+  Program* program;
   Grid g;
   int worlds;
   std::vector<Group> groups;
+  std::vector<Plane*> slots;  // of all groups
+  std::vector<Field*> reals;
   std::vector<uint8_t> idle;  // whether each world's cells do not matter; empty: they all do
   int lanes() const { return worlds * g.strips; }  // what lies side by side, in all groups
   bool is_idle(int world) const { return !idle.empty() && idle[world]; }
@@ -27,8 +30,8 @@ struct Batch {
 constexpr size_t LARGE_PLANE = 32 << 10;  // bytes from which a plane of LANES worlds is too large to be kept near
 constexpr int GROUP_WORK = 8;             // what a step of a group costs beside that of its words, in words
 // Strips fill lanes where few worlds run, and keep less at hand where worlds are large.
-static Grid make_grid(int worlds, int height, int width) {
-  const int words = (width + BITS - 1) / BITS, least_rows = std::max({1, AROUND_ROWS, BEYOND_ROWS});  // only the next strip is asked
+static Grid make_grid(const Program& program, int worlds, int height, int width) {
+  const int words = (width + BITS - 1) / BITS, least_rows = std::max({1, program.around_rows, program.beyond_rows});  // only the next strip is asked
   const bool large = sizeof(V) * height * words >= LARGE_PLANE;
   Grid g;
   int64_t least = INT64_MAX;
@@ -36,7 +39,7 @@ static Grid make_grid(int worlds, int height, int width) {
     const int64_t groups = ((int64_t)worlds * strips + LANES - 1) / LANES, work = groups * (height / strips * words + GROUP_WORK);
     if (work < least || large) least = work, g.strips = strips;
   }
-  g.height = height / g.strips;
+  g.height = height / g.strips, g.around_rows = program.around_rows, g.beyond_rows = program.beyond_rows;
 #if !WIDTH
   g.width = width, g.words = words, g.stride = stride_of(width);
 #endif
@@ -57,8 +60,9 @@ template <class Of> ALWAYS void by_hash(U* parts, Of of) {
     for (int i = 0; i < HASHES; i++) parts[l % PARTS][l / PARTS * HASHES + i] = number;
   }
 }
-static Context* new_context(const Grid& g) {
+static Context* new_context(Program& program, const Grid& g) {
   Context* c = new (std::align_val_t(64)) Context();
+  c->program = &program;
   c->g = g;
 #if !WIDTH
   c->rest = g.width - BITS * (g.words - 1);
@@ -75,24 +79,27 @@ static Context* new_context(const Grid& g) {
   c->everything = new Plane{aligned<V>(g.cells() + g.halos()), 1, false, 0, 0};
   for (int i = 0; i < g.cells(); i++) c->everything->data[i] = c->valid(i % g.words);
   c->calm = new Field{nullptr, aligned<uint8_t>(LANES * g.height), 1, true};
-  c->nothing_row = aligned<V>(g.words);
-  c->change = aligned<V>(2 * g.words);
-  c->late = aligned<V>((MOVING + 1) * g.words);
-  c->entered = aligned<V>(g.height + 1);
-  c->moving = aligned<int>(g.height + 1);
+  auto room = [&](auto*& array, size_t count) {
+    array = aligned<std::remove_reference_t<decltype(*array)>>(count);
+    c->memory.push_back(array);
+  };
+  room(c->nothing_row, g.words), room(c->change, 2 * g.words), room(c->late, (program.moving + 1) * g.words);
+  room(c->from, program.moving), room(c->to, program.moving), room(c->entered, g.height + 1), room(c->moving, g.height + 1);
   const u32 across = (g.width + 31) / 32;
   by_hash(c->strip_starts, [&](int l) { return l % g.strips * g.height * across * 32 * APART; });
-  c->zeros = aligned<float>(g.stride + HALO + CHUNK);
-  c->turned = aligned<Word>((size_t)LANES * g.height * g.words * TURNED);
-  c->marks = aligned<u32>((size_t)(MARKS + 1) * g.height);
-  c->waiting = aligned<float>((size_t)WAITING * g.stride + HALO + CHUNK);
-  for (int i = 0; i < COINS; i++) c->coins[i] = aligned<V>(g.cells());
-  for (const FixedPlane& f : FIXED) {
-    V* plane = aligned<V>(g.cells());
+  room(c->zeros, g.stride + HALO + CHUNK), room(c->waiting, (size_t)program.waiting * g.stride + HALO + CHUNK);
+  room(c->turned, (size_t)LANES * g.height * g.words * program.turned), room(c->marks, (size_t)program.marks * g.height);
+  room(c->k0, program.streams.size()), room(c->k1, program.streams.size());
+  room(c->step_bits, program.steps.size()), room(c->param_bits, program.param_planes), room(c->param_real, program.param_reals);
+  room(c->slot, program.slots), room(c->real, program.reals), room(c->coins, program.coins), room(c->tossed, program.coins);
+  room(c->fixed, program.fixed.size());
+  for (int i = 0; i < program.coins; i++) room(c->coins[i], g.cells());
+  for (size_t i = 0; i < program.fixed.size(); i++) {
+    V*& plane = c->fixed[i];
+    room(plane, g.cells());
     for (int y = 0; y < g.height; y++)
       for (int x = 0; x < g.width; x++)
-        for (int l = 0; l < LANES; l++) plane[y * g.words + x / BITS][l] |= (Word)fixed_flag(f, g, l, y, x) << (x % BITS);
-    c->fixed.push_back(plane);
+        for (int l = 0; l < LANES; l++) plane[y * g.words + x / BITS][l] |= (Word)fixed_flag(program.fixed[i], g, l, y, x) << (x % BITS);
   }
   return c;
 }
@@ -102,36 +109,26 @@ static void free_context(Context* c) {
   release(c->nothing);
   release(c->everything);
   release(c->calm);
-  free(c->nothing_row);
-  free(c->change);
-  free(c->late);
-  free(c->entered);
-  free(c->moving);
-  free(c->zeros);
-  free(c->turned);
-  free(c->marks);
-  free(c->waiting);
-  for (V* p : c->fixed) free(p);
-  for (int i = 0; i < COINS; i++) free(c->coins[i]);
+  for (void* array : c->memory) free(array);
   c->~Context();
   operator delete(c, std::align_val_t(64));
 }
 
-// Contexts wait here between calls: at most a few, of the grids used last.
 static Mutex contexts_lock;
-static std::vector<Context*> contexts;
-static Context* borrow(const Grid& g) {
+static Context* borrow(Program& program, const Grid& g) {
   Hold hold(contexts_lock);
+  std::vector<Context*>& contexts = program.contexts;
   for (size_t i = 0; i < contexts.size(); i++)
     if (contexts[i]->g == g) {
       Context* c = contexts[i];
       contexts.erase(contexts.begin() + i);
       return c;
     }
-  return new_context(g);
+  return new_context(program, g);
 }
 static void put_back(Context* c) {
   Hold hold(contexts_lock);
+  std::vector<Context*>& contexts = c->program->contexts;
   contexts.push_back(c);
   if (contexts.size() > 16) {
     free_context(contexts.front());
@@ -140,11 +137,11 @@ static void put_back(Context* c) {
 }
 
 static void reset_slots(Context& c) {
-  for (const ResetPlane& r : RESET_PLANES) {
+  for (const ResetPlane& r : c.program->reset_planes) {
     give(c, c.slot[r.slot]);
     c.slot[r.slot] = keep(r.value ? c.everything : c.nothing);
   }
-  for (const ResetReal& r : RESET_REALS) {
+  for (const ResetReal& r : c.program->reset_reals) {
     give(c, c.real[r.slot]);
     if (r.value == 0) {
       c.real[r.slot] = keep(c.calm);
@@ -161,43 +158,45 @@ struct Clocks {
   u64 since;  // steps after `step`
 };
 static void begin_step(Context& c, const Clocks& k, long done) {
+  const Program& program = *c.program;
   U step[PARTS];
   by_hash(step, [&](int l) { return (u32)(k.step[c.worlds[l]] + done); });
   for (int i = 0; i < PARTS; i++) {
     const U first = mix(c.world_keys[0][i] + step[i]), second = mix(c.world_keys[1][i] + step[i]);
-    for (int s = 0; s < STREAMS; s++) {
-      c.k0[s][i] = mix(first + splatu(STREAM_IDENT[s])) + c.strip_starts[i];
-      c.k1[s][i] = mix(second + splatu(STREAM_IDENT[s]));
+    for (size_t s = 0; s < program.streams.size(); s++) {
+      c.k0[s][i] = mix(first + splatu(program.streams[s])) + c.strip_starts[i];
+      c.k1[s][i] = mix(second + splatu(program.streams[s]));
     }
   }
-  std::fill_n(c.tossed, COINS, false);
-  for (int i = 0; i < STEP_PLANES; i++)
+  std::fill_n(c.tossed, program.coins, false);
+  for (size_t i = 0; i < program.steps.size(); i++)
     for (int l = 0; l < LANES; l++) {
-      u64 step = k.step[c.worlds[l]] + done;
-      c.step_bits[i][l] = (step % STEP_TABLE[i].a) >> STEP_TABLE[i].b & 1 ? FULL : 0;
+      const u64 step = k.step[c.worlds[l]] + done;
+      c.step_bits[i][l] = (step % program.steps[i].a) >> program.steps[i].b & 1 ? FULL : 0;
     }
 }
 // Finds which of the ids that passes ask for are present, from products of their low and high bits.
 static void look(Context& c) {
-  constexpr int LOW = ELEMENTS / 2, IDS = std::min(1 << ELEMENTS, 64);
-  V found[IDS] = {};
+  const std::vector<int>& elements = c.program->elements;
+  const int bits = elements.size(), low = bits / 2;
+  const u64 asked = c.program->asked;
+  V found[64] = {};
   for (int i = 0; i < c.g.cells(); i++) {
-    V part[2][1 << (ELEMENTS - LOW)];
+    V part[2][16];
     part[0][0] = part[1][0] = splat(FULL);
-#pragma GCC unroll 8
-    for (int bit = 0; bit < ELEMENTS; bit++) {
-      const V flags = c.slot[ELEMENT[bit]]->data[i];
-      V* products = part[bit >= LOW];
-      const int count = 1 << (bit < LOW ? bit : bit - LOW);
-#pragma GCC unroll 8
+    for (int bit = 0; bit < bits; bit++) {
+      const V flags = c.slot[elements[bit]]->data[i];
+      V* products = part[bit >= low];
+      const int count = 1 << (bit < low ? bit : bit - low);
       for (int k = 0; k < count; k++) products[count + k] = products[k] & flags, products[k] &= ~flags;
     }
-#pragma GCC unroll 64
-    for (int id = 0; id < IDS; id++)
-      if (ASKED >> id & 1) found[id] |= part[0][id & ((1 << LOW) - 1)] & part[1][id >> LOW];
+    for (u64 ids = asked; ids; ids &= ids - 1) {
+      const int id = __builtin_ctzll(ids);
+      found[id] |= part[0][id & ((1 << low) - 1)] & part[1][id >> low];
+    }
   }
   c.present = 0;
-  for (int id = 0; id < IDS; id++) c.present |= (u64)(ASKED >> id & 1 && any(found[id])) << id;
+  for (int id = 0; id < 64; id++) c.present |= (u64)any(found[id]) << id;
 }
 // The bits and numbers of each world, one after another; of one world, unless each has its `own`.
 struct Parameters {
@@ -206,14 +205,15 @@ struct Parameters {
   const float* reals;
 };
 static void load_parameters(Context& c, const Parameters& parameters) {
+  const int planes = c.program->param_planes, numbers = c.program->param_reals;
   for (int first = 0, end; first < LANES; first = end) {  // lanes with the same parameters
     const int world = parameters.own ? c.worlds[first] : 0;
     for (end = first + 1; end < LANES && (!parameters.own || c.worlds[end] == world);) end++;
     const Flags lanes = flags_of(first, end);
-    const uint8_t* bits = parameters.bits + (size_t)world * PARAM_PLANES;
-    const float* reals = parameters.reals + (size_t)world * PARAM_REALS;
-    for (int i = 0; i < PARAM_PLANES; i++) c.param_bits[i] = (first ? c.param_bits[i] : Flags{}) | (bits[i] ? lanes : Flags{});
-    for (int i = 0; i < PARAM_REALS; i++) std::fill(c.param_real[i] + first, c.param_real[i] + end, reals[i]);
+    const uint8_t* bits = parameters.bits + (size_t)world * planes;
+    const float* reals = parameters.reals + (size_t)world * numbers;
+    for (int i = 0; i < planes; i++) c.param_bits[i] = (first ? c.param_bits[i] : Flags{}) | (bits[i] ? lanes : Flags{});
+    for (int i = 0; i < numbers; i++) std::fill(c.param_real[i] + first, c.param_real[i] + end, reals[i]);
   }
 }
 static void run_group(Context& c, Batch& b, int number, long steps, const Clocks& k, const Parameters& parameters) {
@@ -229,24 +229,25 @@ static void run_group(Context& c, Batch& b, int number, long steps, const Clocks
       return key;
     });
   }
+  const Program& program = *c.program;
   Group& group = b.groups[number];
-  for (int i = 0; i < SLOTS; i++) {
+  for (int i = 0; i < program.slots; i++) {
     c.slot[i] = group.slot[i];
     if (c.slot[i]->zero) {  // an empty plane of a batch may hold anything
       give(c, c.slot[i]);
       c.slot[i] = keep(c.nothing);
     }
   }
-  for (int i = 0; i < REALS; i++) c.real[i] = group.real[i];
+  for (int i = 0; i < program.reals; i++) c.real[i] = group.real[i];
   c.present = group.present;
   for (long s = 0; s < steps; s++) {
     begin_step(c, k, (long)k.since + s);
     reset_slots(c);
-    if (ASKED && c.present == ~0ull) look(c);
-    run_passes(c);
+    if (program.asked && c.present == ~0ull) look(c);
+    program.run(c);
   }
-  for (int i = 0; i < SLOTS; i++) own(c, c.slot[i]), group.slot[i] = c.slot[i];
-  for (int i = 0; i < REALS; i++) own(c, c.real[i]), group.real[i] = c.real[i];
+  for (int i = 0; i < program.slots; i++) own(c, c.slot[i]), group.slot[i] = c.slot[i];
+  for (int i = 0; i < program.reals; i++) own(c, c.real[i]), group.real[i] = c.real[i];
   group.present = c.present;
 }
 
@@ -353,19 +354,20 @@ template <class T> static void load_values(Batch& b, int slot, int bits, const T
   }
 }
 
-#define API extern "C" __attribute__((visibility("default")))
-static Batch* new_batch(int worlds, const Grid& g) {
-  Batch* b = new Batch{g, worlds};
+static Batch* new_batch(Program& program, int worlds, const Grid& g) {
+  Batch* b = new Batch{&program, g, worlds};
   b->groups.resize((b->lanes() + LANES - 1) / LANES);
-  for (Group& group : b->groups) {
-    group.present = ~0ull;
-    for (int i = 0; i < SLOTS; i++) {
+  b->slots.resize(b->groups.size() * program.slots), b->reals.resize(b->groups.size() * program.reals);
+  for (size_t n = 0; n < b->groups.size(); n++) {
+    Group& group = b->groups[n];
+    group = {b->slots.data() + n * program.slots, b->reals.data() + n * program.reals, ~0ull};
+    for (int i = 0; i < program.slots; i++) {
       Plane* p = group.slot[i] = new_plane(g);
       p->refs = 1;
       p->zero = true;
       p->around = p->beyond = 0;
     }
-    for (int i = 0; i < REALS; i++) {
+    for (int i = 0; i < program.reals; i++) {
       Field* f = group.real[i] = new_field(b->g);
       f->refs = 1;
       f->still = true;
@@ -375,8 +377,8 @@ static Batch* new_batch(int worlds, const Grid& g) {
   return b;
 }
 // Worlds of a width that the library is for. `running`: about how many are not idle; 0: all.
-API void* pd_new(int worlds, int height, int width, int running) {
-  return new_batch(worlds, make_grid(running ? running : worlds, height, width));
+API void* pd_new(Program* program, int worlds, int height, int width, int running) {
+  return new_batch(*program, worlds, make_grid(*program, running ? running : worlds, height, width));
 }
 API void pd_rest(void* batch, const uint8_t* idle) {
   Batch& b = *(Batch*)batch;
@@ -384,24 +386,22 @@ API void pd_rest(void* batch, const uint8_t* idle) {
 }
 API void pd_free(void* batch) {
   Batch* b = (Batch*)batch;
-  for (Group& group : b->groups) {
-    for (int i = 0; i < SLOTS; i++) drop(b->g, group.slot[i]);
-    for (int i = 0; i < REALS; i++) drop(b->g, group.real[i]);
-  }
+  for (Plane* p : b->slots) drop(b->g, p);
+  for (Field* f : b->reals) drop(b->g, f);
   delete b;
 }
 API void* pd_copy(const void* batch) {
   const Batch* a = (const Batch*)batch;
-  Batch* b = new_batch(a->worlds, a->g);
+  Batch* b = new_batch(*a->program, a->worlds, a->g);
   for (size_t n = 0; n < a->groups.size(); n++) {
     b->groups[n].present = a->groups[n].present;
-    for (int i = 0; i < SLOTS; i++) {
+    for (int i = 0; i < b->program->slots; i++) {
       const Plane* from = a->groups[n].slot[i];
       Plane* to = b->groups[n].slot[i];
       if (!from->zero) memcpy(to->data, from->data, sizeof(V) * a->g.cells());
       to->zero = from->zero;
     }
-    for (int i = 0; i < REALS; i++) {
+    for (int i = 0; i < b->program->reals; i++) {
       const Field* from = a->groups[n].real[i];
       Field* to = b->groups[n].real[i];
       memcpy(to->live, from->live, LANES * a->g.height);
@@ -413,7 +413,6 @@ API void* pd_copy(const void* batch) {
   return b;
 }
 static void load_reals(Batch& b, int slot, const float* data, int64_t apart) {
-  Context* c = borrow(b.g);
   for (Group& group : b.groups) {
     group.real[slot]->still = true;
     memset(group.real[slot]->live, 0, LANES * b.g.height);
@@ -427,10 +426,9 @@ static void load_reals(Batch& b, int slot, const float* data, int64_t apart) {
       memcpy(row, cells + (int64_t)y * b.g.width, sizeof(float) * b.g.width);
       f->live[r] = std::any_of(row, row + b.g.width, [](float v) { return v != 0; });
       if (f->live[r]) f->still = false;
-      finish_row(*c, row);
+      finish_row(b.g, row);
     }
   }
-  put_back(c);
 }
 // In the following functions, slots without bits are floats, and `item` is the bytes of a cell.
 API void pd_load(void* batch, int slot, int bits, int item, const void* data, int64_t apart) {
@@ -469,7 +467,6 @@ template <class T> static void put_values(Batch& b, int slot, int bits, int coun
   });
 }
 static void put_reals(Batch& b, int slot, int count, const int64_t* places, const float* data) {
-  Context* c = borrow(b.g);
   in_places(b, count, places, [&](Group& group, int lane, int64_t begin) {
     Field* f = group.real[slot];
     for (int y = 0; y < b.g.height; y++) {
@@ -478,10 +475,9 @@ static void put_reals(Batch& b, int slot, int count, const int64_t* places, cons
       memcpy(row, data + begin + (int64_t)y * b.g.width, sizeof(float) * b.g.width);
       f->live[r] = std::any_of(row, row + b.g.width, [](float v) { return v != 0; });
       if (f->live[r]) f->still = false;
-      finish_row(*c, row);
+      finish_row(b.g, row);
     }
   });
-  put_back(c);
 }
 API void pd_put(void* batch, int slot, int bits, int item, const void* data, int count, const int64_t* places) {
   Batch& b = *(Batch*)batch;
@@ -524,7 +520,6 @@ static void fill_values(Batch& b, int slot, int bits, const int64_t* boxes, cons
   });
 }
 static void fill_reals(Batch& b, int slot, const int64_t* boxes, const float* values) {
-  Context* c = borrow(b.g);
   in_boxes(b, boxes, [&](Group& group, int lane, int world, int first, int last, const int64_t* box) {
     Field* f = group.real[slot];
     for (int y = first; y < last; y++) {
@@ -535,10 +530,9 @@ static void fill_reals(Batch& b, int slot, const int64_t* boxes, const float* va
       std::fill(row + box[2], row + box[3], values[world]);
       f->live[r] = values[world] != 0 || std::any_of(row, row + b.g.width, [](float v) { return v != 0; });
       if (f->live[r]) f->still = false;
-      finish_row(*c, row);
+      finish_row(b.g, row);
     }
   });
-  put_back(c);
 }
 API void pd_fill(void* batch, int slot, int bits, const void* values, const int64_t* boxes) {
   Batch& b = *(Batch*)batch;
@@ -553,7 +547,7 @@ API void* pd_run(void* batch, int copy, int64_t steps, int threads, const u64* s
   int count = seconds ? 1 : std::max(1, std::min(threads, (int)b.groups.size()));
   std::atomic<int> next{0};
   auto task = [&](int) {
-    Context* c = borrow(b.g);
+    Context* c = borrow(*b.program, b.g);
     c->seconds = seconds;
     for (int n; (n = next++) < (int)b.groups.size();)
       if (!b.rests(n)) run_group(*c, b, n, steps, k, Parameters{own != 0, bits, reals});
@@ -561,4 +555,11 @@ API void* pd_run(void* batch, int copy, int64_t steps, int threads, const u64* s
   };
   on_threads(count, task);
   return batch;
+}
+// For programs that are libraries of their own, see pd_program.
+API void* const* pd_shared() {
+#define EACH(result, name, ...) (void*)name,
+  static void* const functions[] = {SHARED(EACH)};
+#undef EACH
+  return functions;
 }

@@ -20,7 +20,7 @@ template <class T> static void load_piece(void* batch, const PieceData& piece, c
 }
 static const void* start_worlds() {  // made once, and shared
   static const void* pool = [] {
-    void* batch = pd_new(WORLDS, ROWS, COLUMNS, 0);
+    void* batch = pd_new(&PROGRAM, WORLDS, ROWS, COLUMNS, 0);
     std::vector<uint8_t> ids;
     for (const u32* run = PIECES[0].runs; ids.size() < (size_t)WORLDS * ROWS * COLUMNS; run += 2) ids.insert(ids.end(), run[0], (uint8_t)run[1]);
     for (const PieceData& piece : PIECES) {
@@ -39,7 +39,7 @@ API powder_env* powder_new(int worlds) {
   Play& p = env->play;
   describe(p);
   p.pool = start_worlds(), p.start_worlds = WORLDS;
-  p.batch = pd_new(worlds, ROWS, COLUMNS, 0);
+  p.batch = pd_new(&PROGRAM, worlds, ROWS, COLUMNS, 0);
   auto rows = [&](auto& vector, auto*& pointer, size_t size) { vector.resize(worlds * size), pointer = vector.data(); };
   rows(env->seed, p.seed, 1), rows(env->index, p.index, 1), rows(env->step, p.step, 1);
   rows(env->world, p.world, 1), rows(env->acted, p.acted, 1), rows(env->episode, p.episode, 1), rows(env->base, p.base, 1);

@@ -14,7 +14,7 @@ static void copy_world(Batch& to, int at, const Batch& from, int source) {
   Group& changed = to.groups[line_of(to, at, 0).group];
   const Group& given = from.groups[line_of(from, source, 0).group];
   changed.present = ~0ull;
-  for (int i = 0; i < SLOTS; i++) {
+  for (int i = 0; i < to.program->slots; i++) {
     Plane* p = changed.slot[i];
     const Plane* q = given.slot[i];
     if (p->zero && q->zero) continue;
@@ -27,7 +27,7 @@ static void copy_world(Batch& to, int at, const Batch& from, int source) {
         ((Word*)p->data)[((size_t)a.row * words + w) * LANES + a.lane] = (Word)word_of(q, b.lane, b.row * words + w);
     }
   }
-  for (int i = 0; i < REALS; i++) {
+  for (int i = 0; i < to.program->reals; i++) {
     Field* f = changed.real[i];
     const Field* h = given.real[i];
     for (int y = 0; y < rows; y++) {
@@ -173,23 +173,23 @@ static void act(Play& p, Batch& b, const int64_t* actions) {
 }
 // Steps of some worlds, in ascending order, with the clocks and parameters of `p`.
 template <class P> static void run_some(P& p, Batch& b, const std::vector<int>& places, int64_t steps) {
-  const size_t count = places.size(), worlds = b.worlds;
+  const size_t count = places.size(), worlds = b.worlds, bits_each = b.program->param_planes, reals_each = b.program->param_reals;
   if (count == worlds) {
     pd_run(&b, 0, steps, p.threads, p.seed, p.index, p.step, 0, p.own_params, p.param_bits, p.param_reals, nullptr);
     for (size_t i = 0; i < worlds; i++) p.step[i] += steps;
     return;
   }
-  Batch* part = (Batch*)pd_new(count, b.g.world_height(), b.g.width, 0);
+  Batch* part = (Batch*)pd_new(b.program, count, b.g.world_height(), b.g.width, 0);
   std::vector<u64> seed(count), index(count), step(count);
-  std::vector<uint8_t> bits(count * PARAM_PLANES + 1);
-  std::vector<float> reals(count * PARAM_REALS + 1);
+  std::vector<uint8_t> bits(count * bits_each + 1);
+  std::vector<float> reals(count * reals_each + 1);
   for (size_t k = 0; k < count; k++) {
     const int i = places[k];
     copy_world(*part, k, b, i);
     seed[k] = p.seed[i], index[k] = p.index[i], step[k] = p.step[i];
     const size_t from = p.own_params ? i : 0;
-    std::copy_n(p.param_bits + from * PARAM_PLANES, PARAM_PLANES, &bits[k * PARAM_PLANES]);
-    std::copy_n(p.param_reals + from * PARAM_REALS, PARAM_REALS, &reals[k * PARAM_REALS]);
+    std::copy_n(p.param_bits + from * bits_each, bits_each, &bits[k * bits_each]);
+    std::copy_n(p.param_reals + from * reals_each, reals_each, &reals[k * reals_each]);
   }
   pd_run(part, 0, steps, p.threads, seed.data(), index.data(), step.data(), 0, 1, bits.data(), reals.data(), nullptr);
   for (size_t k = 0; k < count; k++) copy_world(b, places[k], *part, k), p.step[places[k]] += steps;

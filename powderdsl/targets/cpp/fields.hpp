@@ -1,4 +1,4 @@
-// Rows of reals, and the rows of planes that they ask for. Comes after movements.hpp.
+// Rows of reals, and the rows of planes that they ask for. Comes after planes.hpp.
 
 // Real rows.
 ALWAYS const float* real_line(const Context& c, const Field& f, int line, const float* nothing) {
@@ -13,7 +13,6 @@ ALWAYS F inside_columns(F value, int x, int dx, int width) {
   I at = number + (x + dx);
   return (F)((I)value & (at >= 0) & (at < width));
 }
-ALWAYS F load(const float* row, int x) { return (F)*(const Fu*)(row + x); }
 // A word of a lane, and all words of one of its rows together.
 ALWAYS Word& lane_word(V* plane, int i, int lane) { return ((Word*)plane)[i * LANES + lane]; }
 // Which lanes have anything in each row of some planes.
@@ -51,7 +50,7 @@ static void close_plane(const Context& c, Plane* p) {  // nothing beyond the wid
     for (int w = 0; w < c.g.words; w++, i++) some |= p->data[i] &= c.valid(w);
   p->zero = !any(some);
 }
-// Masks of choices, lane by lane: [LANES][height][words][c.masks], so that a lane finds the words of all masks side by side.
+// Masks of choices, lane by lane: [LANES][height][words][TURNED], so that a lane finds the words of all masks side by side.
 ALWAYS void turn(const V* in, V* out, int lanes) {  // TURN vectors; squares of as many words
 #ifdef SHUFFLES
   V number;
@@ -82,10 +81,10 @@ OUTLINE void turn_masks(Context& c, const Plane* const* planes, int count, int p
       for (int k = 0; k < TURN; k++) in[k] = from + k < count ? planes[from + k]->data[i] : splat(0);
       turn(in, out, c.lanes);
       for (int l = 0; l < c.lanes; l++)
-        *(Turned*)(c.turned + ((size_t)l * cells + i) * c.masks + place + from) = ((const Turned*)&out[l % TURN])[l / TURN];
+        *(Turned*)(c.turned + ((size_t)l * cells + i) * TURNED + place + from) = ((const Turned*)&out[l % TURN])[l / TURN];
     }
 }
-ALWAYS const Word* turned_row(const Context& c, int line) { return c.turned + (size_t)line * c.g.words * c.masks; }
+ALWAYS const Word* turned_row(const Context& c, int line) { return c.turned + (size_t)line * c.g.words * TURNED; }
 ALWAYS u32 turned_bits(Turned a) {  // a bit for each mask that has any
 #if VECTOR == 64 && WIDTH == 16
   return _mm256_test_epi16_mask((__m256i)a, (__m256i)a);
@@ -98,7 +97,7 @@ ALWAYS u32 turned_bits(Turned a) {  // a bit for each mask that has any
 ALWAYS bool any_turned(const Context& c, const Word* masks, int count) {
   Turned some = {};
   for (int w = 0; w < c.g.words; w++)
-    for (int from = 0; from < count; from += TURN) some |= *(const Turned*)(masks + w * c.masks + from);
+    for (int from = 0; from < count; from += TURN) some |= *(const Turned*)(masks + w * TURNED + from);
   return turned_bits(some);
 }
 // Which of up to 64 masks hold anything in a word.
@@ -133,38 +132,8 @@ ALWAYS void put_bits(Word* word, int x, u32 bits) {
   const int by = x & (BITS - 1);
   *word = (*word & ~((Word)ALL << by)) | (Word)bits << by;
 }
-// After the chunks of a row: the halo, as far as columns are read beyond the edges.
-template <int FAR = REACH> ALWAYS void finish_row(const Context& c, float* row) {
-  int w = c.g.width;
-  if (__builtin_expect(w >= FAR, 1)) {
-    for (int i = 0; i < FAR; i++) row[w + i] = row[i];
-    for (int i = 1; i <= FAR; i++) row[-i] = row[w - i];
-  } else {
-    for (int i = 0; i < FAR; i++) row[w + i] = row[i % w];
-    for (int i = 1; i <= FAR; i++) row[-i] = row[(w - i % w) % w];
-  }
-}
-
-template <int FAR> ALWAYS void bare_row(const Context& c, float* row) {  // zeros instead
-  for (int i = 0; i < FAR; i++) row[c.g.width + i] = row[-1 - i] = 0;
-}
-ALWAYS float* row_of(const Context& c, const Field& f, int line) { return f.data + (size_t)line * c.g.stride + HALO; }
 ALWAYS float* waiting_row(const Context& c, int i) { return c.waiting + (size_t)i * c.g.stride + HALO; }
-static void copy_floats(const Grid& g, float* to, const float* from) {  // a row and its halo
-  memcpy(to - REACH, from - REACH, sizeof(float) * (g.width + 2 * REACH));
-}
 static bool no_rows_left(const Context& c, const Field* f) { return !memchr(f->live, 1, LANES * c.g.height); }
-// A field of this owner alone, to be written over.
-static void own(Context& c, Field*& f) {
-  if (f != c.calm && f->refs == 1) return;
-  Field* copy = take_field(c);
-  memcpy(copy->live, f->live, LANES * c.g.height);
-  for (int line = 0; line < LANES * c.g.height && !f->still; line++)
-    if (f->live[line]) copy_floats(c.g, row_of(c, *copy, line), row_of(c, *f, line));
-  copy->still = f->still;
-  give(c, f);
-  f = copy;
-}
 // The memory of a field that nothing else needs, or other memory.
 static Field* overtaken(Context& c, Field* f) {
   if (f != c.calm && f->refs == 1) return f;
@@ -222,8 +191,8 @@ template <int COUNT> OUTLINE void swap_fields(Context& c, const Plane* movers, i
           for (int k = 0; k < n; k++) std::swap(from[k][x], to[k][other]);
         }
       for (int k = 0; k < n && edge; k++) {
-        finish_row(c, from[k]);
-        if (there != line) finish_row(c, to[k]);
+        finish_row(c.g, from[k]);
+        if (there != line) finish_row(c.g, to[k]);
       }
     }
   }

@@ -1,4 +1,44 @@
-// Operations on whole planes: shifts, movements in place, planes cleared and joined. Comes after planes.hpp.
+// Operations on whole planes: shifts, movements in place, planes cleared and joined. Comes after memory.hpp.
+
+OUTLINE V columns_far(const Context& c, const V* row, int w, int dx) {  // farther than the last word of a row is wide
+  const int n = c.g.words, rest = c.rest;
+  auto word = [&](int i) -> V {  // words of the endless row: the last is continued by the first
+    if (i < 0) return left(row[n - 1], BITS - rest) | right(row[n - 2], rest);
+    if (i < n - 1) return row[i];
+    return i == n - 1 ? row[i] | left(row[0], rest) : right(row[0], BITS - rest) | left(row[1], rest);
+  };
+  V r = dx > 0 ? right(word(w), dx) | left(word(w + 1), BITS - dx) : left(row[w], -dx) | right(word(w - 1), BITS + dx);
+  return r & c.valid(w);
+}
+// Strips. The lane that each lane sees `by` lanes on, around those of its world.
+ALWAYS V lanes_on(const Context& c, int by) {
+  V number;
+  for (int l = 0; l < LANES; l++) number[l] = l;
+  return mux(splat(c.g.strips - 1), number + splat(by), number);
+}
+ALWAYS V turned(V v, V lanes) {  // what each lane sees there
+#ifdef SHUFFLES
+  return two_of(v, lanes, v);
+#else
+  V r;
+  for (int l = 0; l < LANES; l++) r[l] = v[lanes[l]];
+  return r;
+#endif
+}
+OUTLINE void fill_halo(const Context& c, Plane* p, int rows, bool around) {
+  const int words = c.g.words, height = c.g.height;
+  for (int i = 1; i <= rows; i++)
+    for (int y : {-i, height - 1 + i}) {
+      const int by = strips_on(c, y);
+      const V* from = p->data + (y - by * height) * words;
+      V* to = around ? p->data + c.row(y) : (V*)row_or_nothing(c, p, y);
+      const V lanes = lanes_on(c, by);
+      V kept = splat(FULL);
+      if (!around) for (int l = 0; l < LANES; l++) kept[l] = (u32)((l & (c.g.strips - 1)) + by) < (u32)c.g.strips ? FULL : 0;
+      for (int w = 0; w < words; w++) to[w] = turned(from[w], lanes) & kept;
+    }
+  (around ? p->around : p->beyond) = rows;
+}
 
 OUTLINE Plane* shifted(Context& c, Plane* p, int dy, int dx) {
   if (p->zero) return keep(c.nothing);
@@ -35,24 +75,11 @@ OUTLINE Plane* swap_plane(Context& c, Plane* content, const Plane* movers, const
   r->zero = !any(some);
   return r;
 }
-// A plane of this owner alone, to be written over.
-static void own(Context& c, Plane*& p) {
-  if (p != c.nothing && p != c.everything && p->refs == 1) {
-    p->around = p->beyond = 0;
-    return;
-  }
-  Plane* copy = take(c);
-  if (p->zero) memset(copy->data, 0, sizeof(V) * c.g.cells());
-  else memcpy(copy->data, p->data, sizeof(V) * c.g.cells());
-  copy->zero = p->zero;
-  give(c, p);
-  p = copy;
-}
 // What movers hold arrives in other planes, which are changed only in rows that movers enter.
 OUTLINE void arrive_over(Context& c, Plane* movers, int dy, int dx, Plane* const* olds, Plane** const* news, int count) {
   if (movers->zero) return;
   edges(c, movers, abs(dy));
-  V *from[MOVING + 1], *to[MOVING + 1];
+  V **from = c.from, **to = c.to;
   int n = 0;
   for (int k = 0; k < count; k++) {
     if (olds[k]->zero && (*news[k])->zero) continue;
@@ -72,7 +99,6 @@ OUTLINE void arrive_over(Context& c, Plane* movers, int dy, int dx, Plane* const
   }
 }
 // Planes that move together, in place.
-enum Leaves { NOTHING, EVERYTHING, SAME };  // what movers leave behind
 // Rows of one word, not in strips: every row that changes is read and written once. What leaves it for the next one waits
 // in a register, and a few planes go together, since each waits for what it reads.
 constexpr int TOGETHER = 4;
@@ -131,7 +157,14 @@ template <bool TURNS, bool ROWS> ALWAYS void swap_near_rows(Context& c, V* const
   for (; k + TOGETHER <= count; k += TOGETHER) swap_near<TOGETHER, TURNS, ROWS>(c, data + k, m, rows, dy, by);
   for (; k < count; k++) swap_near<1, TURNS, ROWS>(c, data + k, m, rows, dy, by);
 }
-template <int N, Leaves LEAVES, bool TURNS, bool ROWS> OUTLINE void arrive_near(const Context& c, V* const* planes, const V* m, int count, int edge, int back) {
+// What movers leave in their cells, of all planes: nothing, everything, or what was there.
+struct Left {
+  V clears, sets;
+};
+ALWAYS Left left_by(V movers, Leaves leaves) {
+  return Left{movers & splat(leaves == NOTHING ? FULL : 0), movers & splat(leaves == EVERYTHING ? FULL : 0)};
+}
+template <int N, bool TURNS, bool ROWS> OUTLINE void arrive_near(const Context& c, V* const* planes, const V* m, int count, int edge, int back, Leaves leaves) {
   const int* rows = c.moving;
   const V* entered = c.entered;
   V *data[N], comes[N];
@@ -139,19 +172,21 @@ template <int N, Leaves LEAVES, bool TURNS, bool ROWS> OUTLINE void arrive_near(
   if (ROWS) EACH_PLANE comes[k] = data[k][edge] & m[edge];
   for (int i = 0; i < count; i++) {
     const int y = rows[i];
-    const V gone = m[y], keeps = LEAVES == NOTHING ? ~(gone | entered[i]) : ~entered[i], sets = gone & keeps;
+    const V gone = m[y];
+    const Left rest = left_by(gone, leaves);
+    const V keeps = ~(rest.clears | entered[i]), sets = rest.sets & keeps;
     EACH_PLANE {
       const V a = data[k][y], goes = a & gone, in = around<TURNS>(c, ROWS ? comes[k] : goes, back);
-      data[k][y] = LEAVES == EVERYTHING ? (a & keeps) | in | sets : (a & keeps) | in;
+      data[k][y] = (a & keeps) | in | sets;
       comes[k] = goes;
     }
   }
 }
-template <Leaves LEAVES, bool TURNS, bool ROWS> ALWAYS void arrive_near_rows(Context& c, V* const* data, int count, const V* m, int dy, int back) {
+template <bool TURNS, bool ROWS> ALWAYS void arrive_near_rows(Context& c, V* const* data, int count, const V* m, int dy, int back, Leaves leaves) {
   const int rows = rows_of<true, TURNS>(c, m, dy, back), edge = dy > 0 ? c.g.height - 1 : 0;
   int k = 0;
-  for (; k + TOGETHER <= count; k += TOGETHER) arrive_near<TOGETHER, LEAVES, TURNS, ROWS>(c, data + k, m, rows, edge, back);
-  for (; k < count; k++) arrive_near<1, LEAVES, TURNS, ROWS>(c, data + k, m, rows, edge, back);
+  for (; k + TOGETHER <= count; k += TOGETHER) arrive_near<TOGETHER, TURNS, ROWS>(c, data + k, m, rows, edge, back, leaves);
+  for (; k < count; k++) arrive_near<1, TURNS, ROWS>(c, data + k, m, rows, edge, back, leaves);
 }
 // A row that exchanges with one of other strips, `by` of them on.
 OUTLINE void swap_strips(Context& c, const V* m, V* const* data, int n, int here_row, int there_row, int by, int dx) {
@@ -189,7 +224,7 @@ OUTLINE void swap_words(Context& c, const V* m, V* const* data, int n, int here_
 // Movers exchange what they hold with their targets. No cell is both.
 OUTLINE void swap_planes(Context& c, const Plane* movers, int dy, int dx, Plane** const* planes, int count) {
   if (movers->zero) return;
-  V* data[MOVING + 1];
+  V** const data = c.to;
   int n = 0;
   for (int k = 0; k < count; k++) {
     Plane*& p = *planes[k];
@@ -240,16 +275,16 @@ OUTLINE void swap_planes(Context& c, const Plane* movers, int dy, int dx, Plane*
 }
 // Movers go to their targets, at most a row away. A cell that is both holds what arrives: each row is read before
 // anything arrives there, and what goes around the edge arrives last.
-template <Leaves LEAVES, bool AROUND>
-ALWAYS void arrive_row(const Context& c, V* const* data, int count, int here, int there, const V* m, const V* targets, int dx) {
+template <bool AROUND>
+ALWAYS void arrive_row(const Context& c, V* const* data, int count, int here, int there, const V* m, const V* targets, int dx, Leaves leaves) {
   const int words = c.g.words, by = c.turn(-dx), back = c.g.width - by;
   if (__builtin_expect(words == 1, 1)) {
     const V gone = m[0], keeps = ~targets[0];
+    const Left rest = left_by(gone, leaves);
     for (int k = 0; k < count; k++) {
       const V a = data[k][here], moving = a & gone;
       const V arriving = by ? around(c, moving, by) : moving;
-      if (LEAVES == NOTHING) data[k][here] = a & ~gone;
-      if (LEAVES == EVERYTHING) data[k][here] = a | gone;
+      data[k][here] = (a & ~rest.clears) | rest.sets;
       if (AROUND) c.late[k] = arriving;
       else data[k][there] = (data[k][there] & keeps) | arriving;
     }
@@ -264,11 +299,11 @@ ALWAYS void arrive_row(const Context& c, V* const* data, int count, int here, in
     for (int w = 0; w < words; w++) {
       if (!any(m[w])) continue;
       const int next = next_word(c, w, dx);
+      const Left rest = left_by(m[w], leaves);
       for (int k = 0; k < count; k++) {
         V *from = data[k] + here + w, *to = AROUND ? c.late + k * words : data[k] + there;
         const V moving = *from & m[w];
-        if (LEAVES == NOTHING) *from &= ~m[w];
-        if (LEAVES == EVERYTHING) *from |= m[w];
+        *from = (*from & ~rest.clears) | rest.sets;
         to[w] |= moved_within(c, moving, w, dx);
         if (dx) to[next] |= moved_over(c, moving, w, next, dx);
       }
@@ -281,9 +316,9 @@ ALWAYS void arrive_row(const Context& c, V* const* data, int count, int here, in
     for (int w = 0; w < words; w++) {
       moving[w] = splat(0);
       if (!any(m[w])) continue;
+      const Left rest = left_by(m[w], leaves);
       moving[w] = from[w] & m[w];
-      if (LEAVES == NOTHING) from[w] &= ~m[w];
-      if (LEAVES == EVERYTHING) from[w] |= m[w];
+      from[w] = (from[w] & ~rest.clears) | rest.sets;
     }
     for (int w = 0; w < words; w++) {
       if (!AROUND && !any(targets[w])) continue;
@@ -292,22 +327,22 @@ ALWAYS void arrive_row(const Context& c, V* const* data, int count, int here, in
     }
   }
 }
-template <Leaves LEAVES> OUTLINE void arrive_planes(Context& c, const Plane* movers, int dy, int dx, Plane** const* planes, int count) {
+OUTLINE void arrive_planes(Context& c, const Plane* movers, int dy, int dx, Plane** const* planes, int count, Leaves leaves) {
   if (movers->zero || (!dy && !c.turn(dx))) return;
-  V* data[MOVING + 1];
+  V** const data = c.to;
   int n = 0;
   for (int k = 0; k < count; k++) {
     Plane*& p = *planes[k];
-    if (p->zero && LEAVES != EVERYTHING) continue;
+    if (p->zero && leaves != EVERYTHING) continue;
     own(c, p);
     p->zero = false;
     data[n++] = p->data;
   }
   if (near_rows(c, dy)) {
     const int back = c.turn(-dx);
-    if (!back) arrive_near_rows<LEAVES, false, true>(c, data, n, movers->data, dy, back);
-    else if (dy) arrive_near_rows<LEAVES, true, true>(c, data, n, movers->data, dy, back);
-    else arrive_near_rows<LEAVES, true, false>(c, data, n, movers->data, dy, back);
+    if (!back) arrive_near_rows<false, true>(c, data, n, movers->data, dy, back, leaves);
+    else if (dy) arrive_near_rows<true, true>(c, data, n, movers->data, dy, back, leaves);
+    else arrive_near_rows<true, false>(c, data, n, movers->data, dy, back, leaves);
     return;
   }
   const int words = c.g.words, height = c.g.height;
@@ -316,8 +351,8 @@ template <Leaves LEAVES> OUTLINE void arrive_planes(Context& c, const Plane* mov
     const V* m = movers->data + y * words;
     if (!any_word(m, words)) continue;
     for (int w = 0; w < words; w++) targets[w] = dx ? columns(c, m, w, -dx) : m[w];
-    if (y + dy < 0 || y + dy >= height) arrive_row<LEAVES, true>(c, data, n, y * words, 0, m, targets, dx);
-    else arrive_row<LEAVES, false>(c, data, n, y * words, (y + dy) * words, m, targets, dx);
+    if (y + dy < 0 || y + dy >= height) arrive_row<true>(c, data, n, y * words, 0, m, targets, dx, leaves);
+    else arrive_row<false>(c, data, n, y * words, (y + dy) * words, m, targets, dx, leaves);
   }
   const int edge = dy > 0 ? height - 1 : 0;
   const V* m = movers->data + edge * words;

@@ -17,7 +17,7 @@ from torch import Tensor
 from powderdsl.ir.ops import Program, SlotType
 from powderdsl.system import cache
 from powderdsl.system.reading import read_bytes
-from powderdsl.targets.cpp.build import build, current, load_library
+from powderdsl.targets.cpp.build import Source, build, current, load_library
 from powderdsl.targets.cpp.source import native_source
 from powderdsl.targets.job import Job, Like, OwnedBatch, like_of, shape_of
 from powderdsl.targets.layout import Layout, pieces
@@ -34,6 +34,7 @@ class NativeCode:
     """
 
     library: Path
+    driver: Path
     width: int
     layout: Layout
     pieces: Mapping[str, tuple[SlotType, ...]]
@@ -51,21 +52,23 @@ def compile_program(program: Program, planes: Program, width: int) -> NativeCode
     Raises:
         NoCompiler: there is no C++ compiler, or it failed.
     """
-    source, layout, units = native_source(planes, width)
-    library = build(source, program.name, units)
-    return NativeCode(library, width, layout, pieces(program), tuple(p.name for p in planes.passes))
+    source = native_source(planes, width)
+    passes = Source(source.passes, program.name, source.units)
+    library, driver = build(passes, Source(source.driver, "driver"))
+    names = tuple(pass_.name for pass_ in planes.passes)
+    return NativeCode(library, driver, width, source.layout, pieces(program), names)
 
 
 def recall(key: str) -> NativeCode | None:
-    """The code stored under a key, if its library still exists. Raises NoCompiler if there is no cache folder."""
+    """The code stored under a key, if its libraries still exist. Raises NoCompiler if there is no cache folder."""
     folder = current().place()
     path = cache.find(folder, key)
     if path is None:
         return None
     # Whoever can write into the folder can also replace libraries, so a pickle is as safe as they are.
     code: NativeCode = pickle.loads(read_bytes(path, cache.LIMIT))
-    library = cache.find(folder, code.library.name.split("-")[0])
-    return None if library is None else replace(code, library=library)
+    library, driver = (cache.find(folder, path.name.split("-")[0]) for path in (code.library, code.driver))
+    return None if library is None or driver is None else replace(code, library=library, driver=driver)
 
 
 def remember(key: str, code: NativeCode) -> None:
@@ -180,7 +183,7 @@ class PackedState(OwnedBatch):
         """The worlds `places`, int64 [n], as a new state. `running`: see `NativeProgram.pack`."""
         rows, library, places = len(places), self.program.library, places.contiguous()
         like = {name: (dtype, (rows, *shape[1:])) for name, (dtype, shape) in self.like.items()}
-        taken = PackedState(self.program, library.pd_new(rows, *shape_of(self)[1:], running), like)
+        taken = PackedState(self.program, self.program.new(rows, *shape_of(self)[1:], running), like)
         library.pd_take(taken.handle, None, self.handle, places.data_ptr(), rows)
         return taken
 
@@ -215,7 +218,8 @@ class NativeProgram(Places):
 
     def __init__(self, code: NativeCode, threads: int):
         super().__init__(code.layout, code.pieces)
-        self.library = load_library(code.library)
+        self.library = load_library(code.driver)
+        self.address = load_library(code.library).pd_program(self.library.pd_shared())
         self.code, self.threads = code, threads
         self._inputs: dict[int, ParameterArrays] = {}
         """Keyed by the `id` of the mapping, which the inputs keep alive."""
@@ -250,6 +254,11 @@ class NativeProgram(Places):
         self._inputs[id(params)] = inputs = ParameterArrays(params, bits.contiguous(), floats.contiguous())
         return inputs
 
+    def new(self, worlds: int, height: int, width: int, running: int) -> int:
+        """The handle of a batch in which all cells are 0. `running`: see `pack`."""
+        handle: int = self.library.pd_new(self.address, worlds, height, width, running)
+        return handle
+
     def pack(self, state: Mapping[str, Tensor], running: int = 0) -> PackedState:
         """A state in this program's memory: the argument, if it already is.
 
@@ -257,7 +266,7 @@ class NativeProgram(Places):
         """
         if isinstance(state, PackedState) and state.program is self:
             return state.select(torch.arange(shape_of(state)[0]), running) if running else state
-        handle: int = self.library.pd_new(*shape_of(state), running)
+        handle = self.new(*shape_of(state), running)
         for name, value in state.items():
             if not any(value.stride(axis) for axis in (0, -2, -1)) and not value[0, ..., 0, 0].any():
                 continue  # 0 in all cells, as in a new batch

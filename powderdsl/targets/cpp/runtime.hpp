@@ -1,4 +1,4 @@
-// Planes, fields, and the buffers of a thread. Comes after vectors.hpp.
+// Planes, fields, programs, and the buffers of a thread. Comes after vectors.hpp.
 
 struct Plane {
   V* data;
@@ -22,17 +22,39 @@ struct Grid {
   int width, words, stride;
 #endif
   int strips;  // of a world, in as many lanes: a power of two; 1 if a lane is a world
+  int around_rows, beyond_rows;  // of halos: how far planes are read, on the torus, and with nothing outside
   int cells() const { return height * words; }
   // Strips have halos: behind the rows of a plane lie those above and below on the torus, then the bare ones.
   int above(int y) const { return (height - 1 - y) * words; }  // y < 0
-  int below(int y) const { return (AROUND_ROWS + y) * words; }  // y >= height
-  int halos() const { return strips > 1 ? 2 * (AROUND_ROWS + BEYOND_ROWS) * words : 0; }
+  int below(int y) const { return (around_rows + y) * words; }  // y >= height
+  int halos() const { return strips > 1 ? 2 * (around_rows + beyond_rows) * words : 0; }
   int world_height() const { return strips * height; }
   bool operator==(const Grid& g) const { return height == g.height && width == g.width && strips == g.strips; }
 };
 
+// A program: what its passes need, as the driver reads it.
+struct ResetPlane { int slot; bool value; };
+struct ResetReal { int slot; float value; };
+struct FixedPlane { int kind, a, b; };
+struct StepPlane { u64 a; int b; };
+struct Context;
+struct Program {
+  int slots, reals, param_planes, param_reals, around_rows, beyond_rows;  // as the halos of a grid
+  int coins, moving, turned, waiting, marks;                              // see NativeLayout of targets/layout.py
+  std::vector<ResetPlane> reset_planes;  // slots that a step resets
+  std::vector<ResetReal> reset_reals;
+  std::vector<FixedPlane> fixed;  // planes that follow from places
+  std::vector<StepPlane> steps;   // and from the step
+  std::vector<u32> streams;       // the identity of each
+  std::vector<int> elements;      // the slots of the bits of ids
+  u64 asked;                      // ids whose presence passes test
+  void (*run)(Context&);          // all passes
+  std::vector<Context*> contexts;  // between calls: at most a few, of the grids used last
+};
+
 // Everything one thread needs to run groups: buffers, row tables, keys.
 struct Context {
+  Program* program;
   Grid g;
   std::vector<int> wrapped;  // [height + 32]: word offset of row y - 16 on the torus, for strips in the halo
   std::vector<int> lines;    // [height of a world + 32]: row y - 16 of a world on the torus
@@ -40,25 +62,26 @@ struct Context {
   std::vector<Field*> fields;
   Plane *nothing, *everything;
   Field* calm;  // no row of it is live
+  std::vector<void*> memory;  // of all that follows
   V* nothing_row;
   V *change, *late;  // two rows of words; a row for each plane that moves
+  V **from, **to;    // planes that move
   V* entered;   // [height + 1]: the cells that movers enter, in the rows that a movement changes
   int* moving;  // [height + 1]: these rows
-  Word* turned;                       // masks of choices, lane by lane, see turn_masks
-  static constexpr int masks = TURNED;  // of a word, a multiple of TURN
+  Word* turned;    // masks of choices, lane by lane, see turn_masks
   u32* marks;      // lanes that have anything in a row of some planes, see mark_rows
   float* waiting;  // rows of reals that loops some rows behind read
   float* zeros;
   U world_keys[2][PARTS], strip_starts[PARTS];
-  U k0[STREAMS + 1][PARTS], k1[STREAMS + 1][PARTS];
-  V* coins[COINS + 1];      // planes
-  bool tossed[COINS + 1];  // whether this step has filled them
-  V step_bits[STEP_PLANES + 1];
-  Flags param_bits[PARAM_PLANES + 1];
-  float param_real[PARAM_REALS + 1][LANES];
-  Plane* slot[SLOTS + 1];
-  Field* real[REALS + 1];
-  std::vector<V*> fixed;  // planes of coordinates and insides, made once
+  U (*k0)[PARTS], (*k1)[PARTS];  // by stream
+  V** coins;     // planes
+  bool* tossed;  // whether this step has filled them
+  V* step_bits;
+  Flags* param_bits;
+  float (*param_real)[LANES];
+  Plane** slot;
+  Field** real;
+  V** fixed;  // planes of coordinates and insides, made once
   int lanes, worlds[LANES];  // lanes in use, and the world of each lane; unused lanes are the last world once more
   double* seconds;  // by pass; null if nobody asks
   u64 present;  // the ids that are there, of those that passes ask for; all bits: not known
@@ -78,90 +101,46 @@ struct Context {
   const int* rows() const { return wrapped.data() + HALO; }
 };
 
-template <class T> static T* aligned(size_t count) {
-  size_t bytes = (count * sizeof(T) + 127) / 64 * 64;
-  void* p = aligned_alloc(64, bytes);
-  if (!p) abort();
-  memset(p, 0, bytes);
-  return (T*)p;
-}
-// Buffers of batches that are gone are used again: fresh memory from the system costs more than a step.
-template <class T> struct Spare {
-  Mutex lock;
-  size_t size = 0;
-  std::vector<T*> waiting;
-};
-inline Spare<Plane> spare_planes;  // of all units
-inline Spare<Field> spare_fields;
-static void release(Plane* p) { free(p->data); delete p; }
-static void release(Field* f) { free(f->data); free(f->live); delete f; }
-template <class T> static T* reuse(Spare<T>& spare, size_t size) {
-  Hold hold(spare.lock);
-  if (spare.size != size) {
-    for (T* t : spare.waiting) release(t);
-    spare.waiting.clear();
-    spare.size = size;
-  }
-  if (spare.waiting.empty()) return nullptr;
-  T* t = spare.waiting.back();
-  spare.waiting.pop_back();
-  return t;
-}
-template <class T> static void drop(Spare<T>& spare, T* t, size_t size, size_t most) {
-  {
-    Hold hold(spare.lock);
-    if (spare.size == size && spare.waiting.size() < most) return spare.waiting.push_back(t);
-  }
-  release(t);
-}
-constexpr size_t SPARE_BYTES = 1 << 28;  // at most this much waits, of each kind
-static size_t plane_size(const Grid& g) { return sizeof(V) * (g.cells() + g.halos()); }
-static size_t field_floats(const Grid& g) { return (size_t)LANES * g.height * g.stride + HALO; }
-static size_t field_size(const Grid& g) { return sizeof(float) * field_floats(g); }
-static Plane* new_plane(const Grid& g) {  // what it holds is not defined
-  Plane* p = reuse(spare_planes, plane_size(g));
-  return p ? p : new Plane{aligned<V>(g.cells() + g.halos()), 0, true, 0, 0};
-}
-static Field* new_field(const Grid& g) {
-  Field* f = reuse(spare_fields, field_size(g) + g.height);
-  return f ? f : new Field{aligned<float>(field_floats(g) + CHUNK), aligned<uint8_t>(LANES * g.height), 0, true};
-}
-static void drop(const Grid& g, Plane* p) { drop(spare_planes, p, plane_size(g), SPARE_BYTES / plane_size(g)); }
-static void drop(const Grid& g, Field* f) { drop(spare_fields, f, field_size(g) + g.height, SPARE_BYTES / field_size(g)); }
+// What passes call. It is the driver's, which all programs share unless all is in one file; pd_program tells where it is.
+enum Leaves { NOTHING, EVERYTHING, SAME };  // what movers leave behind
+#define SHARED(EACH) \
+  EACH(Plane*, take, Context& c) \
+  EACH(void, put, Context& c, Plane* p) \
+  EACH(Field*, take_field, Context& c) \
+  EACH(void, own_plane, Context& c, Plane*& p) \
+  EACH(void, own_field, Context& c, Field*& f) \
+  EACH(V, columns_far, const Context& c, const V* row, int w, int dx) \
+  EACH(void, fill_halo, const Context& c, Plane* p, int rows, bool around) \
+  EACH(V, draw_below, const Context& c, int stream, int y, int w, V wanted, int bits, u64 limit) \
+  EACH(V, draw_below_flags, const Context& c, int stream, int y, int w, V wanted, int bits, const Flags* limit) \
+  EACH(V, draw_below_planes, const Context& c, int stream, int y, int w, V wanted, int bits, const V* limit) \
+  EACH(V*, coin_plane, Context& c, int coin, int stream) \
+  EACH(float, draw_cell, const Context& c, int stream, int lane, int y, int x, int bits) \
+  EACH(Plane*, shifted, Context& c, Plane* p, int dy, int dx) \
+  EACH(Plane*, swap_plane, Context& c, Plane* content, const Plane* movers, const Plane* targets, Plane* rest, int dy, int dx) \
+  EACH(void, arrive_over, Context& c, Plane* movers, int dy, int dx, Plane* const* olds, Plane** const* news, int count) \
+  EACH(void, swap_planes, Context& c, const Plane* movers, int dy, int dx, Plane** const* planes, int count) \
+  EACH(void, arrive_planes, Context& c, const Plane* movers, int dy, int dx, Plane** const* planes, int count, Leaves leaves) \
+  EACH(Plane*, cleared, Context& c, Plane* old, const Plane* where) \
+  EACH(Plane*, joined, Context& c, Plane* old, Plane* where)
+#ifdef DRIVER
+#define EACH(result, name, ...) OUTLINE result name(__VA_ARGS__);
+#else
+#define EACH(result, name, ...) inline result (*name)(__VA_ARGS__);
+#endif
+SHARED(EACH)
+#undef EACH
 
-// Not inline: what runs once in a while would fill the processor's instruction cache.
-OUTLINE Plane* take(Context& c) {
-  Plane* p;
-  if (c.planes.empty()) {
-    p = new_plane(c.g);
-  } else {
-    p = c.planes.back();
-    c.planes.pop_back();
-  }
-  p->refs = 1;
-  p->around = p->beyond = 0;
-  return p;
-}
 ALWAYS Plane* keep(Plane* p) { p->refs++; return p; }
-OUTLINE void put(Context& c, Plane* p) { c.planes.push_back(p); }
 ALWAYS void give(Context& c, Plane* p) {
   if (--p->refs == 0) put(c, p);
-}
-ALWAYS Field* take_field(Context& c) {
-  Field* f;
-  if (c.fields.empty()) {
-    f = new_field(c.g);
-  } else {
-    f = c.fields.back();
-    c.fields.pop_back();
-  }
-  f->refs = 1;
-  return f;
 }
 ALWAYS Field* keep(Field* f) { f->refs++; return f; }
 ALWAYS void give(Context& c, Field* f) {
   if (--f->refs == 0) c.fields.push_back(f);
 }
+ALWAYS void own(Context& c, Plane*& p) { own_plane(c, p); }
+ALWAYS void own(Context& c, Field*& f) { own_field(c, f); }
 
 // Seconds spent in each pass, measured where a call asks for them.
 static double thread_seconds() {
@@ -171,9 +150,3 @@ static double thread_seconds() {
 }
 #define START double tick = c.seconds ? thread_seconds() : 0
 #define TICK(i) if (c.seconds) { const double now = thread_seconds(); c.seconds[i] += now - tick; tick = now; }
-
-// Rows of the tables of a program: slots that a step resets, planes that follow from places and from the step.
-struct ResetPlane { int slot; bool value; };
-struct ResetReal { int slot; float value; };
-struct FixedPlane { int kind, a, b; };
-struct StepPlane { u64 a; int b; };

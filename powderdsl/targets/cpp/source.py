@@ -1,8 +1,8 @@
-"""A program on bit planes → one C++ source file: the library, the tables and a function per pass."""
+"""A program on bit planes → C++: a function per pass and the tables; and the driver, which programs share."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from importlib.resources import files
 from typing import NamedTuple
 
@@ -13,13 +13,13 @@ from powderdsl.system.cache import collection_paused
 from powderdsl.targets.cpp.text import pass_text
 from powderdsl.targets.layout import NativeLayout, braced, literal, native_layout
 
-GENERATOR_VERSION = 13
+GENERATOR_VERSION = 14
 """Part of every cache key; increase it when the meaning of generated code changes."""
 
-LIBRARY = ("vectors", "runtime", "planes", "movements", "fields")
-"""Headers before the generated passes, in this order."""
-DRIVER = ("driver", "views", "episodes", "levels")
-"""Headers after the generated passes."""
+LIBRARY = ("vectors", "runtime", "planes")
+"""Headers that passes and driver build on, in this order."""
+DRIVER = ("memory", "draws", "movements", "driver", "views", "episodes", "levels")
+"""Headers of the driver."""
 
 UNIT_SIZE = 40_000
 """Minimum number of letters of generated passes for which compiling two units side by side is faster."""
@@ -29,11 +29,20 @@ ONLY_IN = "#if !defined(UNIT) || UNIT == "
 
 
 class NativeSource(NamedTuple):
-    """A source file, its layout, and the number of units: with UNIT defined as a number, only that unit is compiled."""
+    """Generated passes and the driver as C++, and the layout.
 
-    text: str
+    Passes have `units`: with UNIT defined as a number, only that unit is compiled.
+    """
+
+    passes: str
+    driver: str
     layout: NativeLayout
     units: int
+
+    @property
+    def whole(self) -> str:
+        """All in one source file."""
+        return "\n".join(["#define DRIVER", self.passes, *map(_header, DRIVER)])
 
 
 def known_width(width: int) -> int:
@@ -47,7 +56,7 @@ def known_width(width: int) -> int:
 
 @collection_paused()
 def native_source(program: Program, width: int = 0) -> NativeSource:
-    """The source file of a program. `width`: see `known_width`."""
+    """The sources of a program. `width`: see `known_width`."""
     layout, tested = native_layout(program), 0
     passes, calls = [], []
     for number, pass_ in enumerate(program.passes):
@@ -55,63 +64,56 @@ def native_source(program: Program, width: int = 0) -> NativeSource:
         tested |= tested_ids(schedule)
         passes.append(pass_text(schedule, number, layout))
         calls.append(f"  pass_{number}(c); TICK({number})")
-    sizes: dict[str, object] = {
-        "WIDTH": width,
-        "STREAMS": len(layout.streams),
-        "STEP_PLANES": len(layout.step_planes),
-        "PARAM_PLANES": len(layout.param_planes),
-        "PARAM_REALS": len(layout.param_reals),
-        "SLOTS": len(layout.planes),
-        "COINS": len(layout.coins),
-        "REALS": len(layout.reals),
-    }
-    sizes |= {name.upper(): size for name, size in vars(layout).items() if isinstance(size, int)}
-    sizes |= {"SNAP": literal(SNAP), "PASSES": len(passes)}
-    before, after = "\n".join(map(_header, LIBRARY)), "\n".join(map(_header, DRIVER))
+    shape = {"WIDTH": width, "HALO": layout.halo, "REACH": layout.reach}
+    sizes = {"TURNED": layout.turned, "MARKED": layout.marked, "SNAP": literal(SNAP)}
     units = 2 if sum(map(len, passes)) >= UNIT_SIZE else 1
     lines = [
         f"// {len(passes)} passes, generated; version {GENERATOR_VERSION}",
-        *map("#define {} {}".format, sizes, sizes.values()),
-        before,
-        *_assign_units(passes, units, len(after)),
+        *_definitions(shape | sizes),
+        *map(_header, (*LIBRARY, "fields")),
+        *_assign_units(passes, units),
         f"{ONLY_IN}0",
-        *_tables(program, layout, tested),
         "static void run_passes(Context& c) {\n  START;",
         *calls,
         "}",
-        after,
+        _table(program, layout, tested),
+        _header("program"),
         "#endif\n",
     ]
-    return NativeSource("\n".join(lines), layout, units)
+    driver = ["#define DRIVER", *_definitions(shape), *map(_header, (*LIBRARY, *DRIVER))]
+    return NativeSource("\n".join(lines), "\n".join(driver), layout, units)
+
+
+def _definitions(sizes: Mapping[str, object]) -> Iterator[str]:
+    yield from map("#define {} {}".format, sizes, sizes.values())
 
 
 def _header(name: str) -> str:
     return (files("powderdsl.targets.cpp") / f"{name}.hpp").read_text(encoding="utf-8")
 
 
-def _tables(program: Program, layout: NativeLayout, tested: int) -> Iterator[str]:
-    """Tables of the slots that a step resets, of planes and of streams; the ids whose presence passes test."""
+def _table(program: Program, layout: NativeLayout, tested: int) -> str:
+    """The definition of PROGRAM (runtime.hpp). `tested`: the ids whose presence passes test."""
     planes, reals, elements = [], [], []
     for slot in program.slots:
         if slot.name.startswith(ELEMENT):
             elements.append(layout.planes[slot.name])
         if slot.resets and slot.name in layout.planes:
-            planes.append((layout.planes[slot.name], int(slot.default)))
+            planes.append(braced((layout.planes[slot.name], int(slot.default))))
         elif slot.resets:
-            reals.append((layout.reals[slot.name], literal(float(slot.default))))
+            reals.append(braced((layout.reals[slot.name], literal(float(slot.default)))))
+    numbers = [len(layout.planes), len(layout.reals), len(layout.param_planes), len(layout.param_reals)]
+    numbers += [layout.around_rows, layout.beyond_rows, len(layout.coins)]
+    numbers += [layout.moving, layout.turned, layout.waiting, layout.marks]
+    fixed, steps = map(braced, layout.fixed), map(braced, layout.step_planes)
     idents = [f"{ident}u" for _, ident, _ in program.streams]
-    yield f"static const std::vector<ResetPlane> RESET_PLANES = {braced(map(braced, planes))};"
-    yield f"static const std::vector<ResetReal> RESET_REALS = {braced(map(braced, reals))};"
-    yield f"static const std::vector<FixedPlane> FIXED = {braced(map(braced, layout.fixed))};"
-    yield f"static const std::vector<StepPlane> STEP_TABLE = {braced(map(braced, layout.step_planes))};"
-    yield f"static const std::vector<u32> STREAM_IDENT = {braced(idents)};"
-    yield f"constexpr int ELEMENTS = {len(elements)}, ELEMENT[] = {braced([*elements, 0])};"
-    yield f"constexpr u64 ASKED = {tested:#x}ull;"
+    tables = map(braced, (planes, reals, fixed, steps, idents, elements))
+    return f"static Program PROGRAM{braced((*numbers, *tables, f'{tested:#x}ull', 'run_passes'))};"
 
 
-def _assign_units(passes: Sequence[str], units: int, driver: int) -> Iterator[str]:
-    """The passes, divided into units of about the same length; the first unit also has a driver of `driver` letters."""
-    sizes = [driver, *[0] * (units - 1)]
+def _assign_units(passes: Sequence[str], units: int) -> Iterator[str]:
+    """The passes, divided into units of about the same length."""
+    sizes = [0] * units
     chosen: dict[str, int] = {}
     for text in sorted(passes, key=len, reverse=True):
         chosen[text] = sizes.index(min(sizes))

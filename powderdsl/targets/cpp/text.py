@@ -153,8 +153,10 @@ class _Printer(Printer):
             call = f"arrive_over(c, {movers}, {dy}, {dx}, olds, news, {len(news)});"
             yield f"{{ Plane* const olds[] = {{{olds}}}; Plane** const news[] = {{{', '.join(news)}}}; {call} }}"
         for leaves, planes in groups.items() if groups and not copies else ():
-            function = "swap_planes" if move.op == "swap" else f"arrive_planes<{leaves.upper()}>"
-            call = f"{function}(c, {movers}, {dy}, {dx}, all, {len(planes)});"
+            function, more = (
+                ("swap_planes", "") if move.op == "swap" else ("arrive_planes", f", {leaves.upper()}")
+            )
+            call = f"{function}(c, {movers}, {dy}, {dx}, all, {len(planes)}{more});"
             yield on_all("Plane** const", map("&{0.var.name}".format, planes), call)
 
     def update(self, loop: Compute) -> Iterator[str]:
@@ -287,11 +289,11 @@ class _Words(WordText):
         if node.op == "chance":
             return f"draw_below(c, {stream}, y, w, {wanted}, {bits}, {node.attr[2]}ull)"
         if node.op == "below_param":
-            limit = f"c.param_bits + {self.layout.limit(node)}"
+            kind, limit = "flags", f"c.param_bits + {self.layout.limit(node)}"
         else:
-            limit = self.fresh("limit")
+            kind, limit = "planes", self.fresh("limit")
             self.lines.append(f"const V {limit}[] = {{{', '.join(args[: bits + 1])}}};")
-        return f"draw_below_planes(c, {stream}, y, w, {wanted}, {bits}, {limit})"
+        return f"draw_below_{kind}(c, {stream}, y, w, {wanted}, {bits}, {limit})"
 
     def shift(self, node: Node) -> str:
         dy, dx, wraps = node.attr

@@ -4,27 +4,13 @@
 // word of all worlds of the group.
 // Reals lie by world and row, with a halo of wrapped columns on both sides. Nothing here knows any rule.
 #include <algorithm>
-#include <atomic>
-#include <cmath>
 #include <cstdint>
 #include <cstdlib>
 #include <cstring>
 #include <ctime>
-#include <functional>
-#include <limits>
 #include <vector>
-#if !defined(__wasm__)
-#include <condition_variable>
-#include <mutex>
-#include <thread>
-typedef std::mutex Mutex;
-typedef std::lock_guard<std::mutex> Hold;
-#else  // has one thread
+#if defined(__wasm__)
 #define CLOCK_THREAD_CPUTIME_ID CLOCK_MONOTONIC
-struct Mutex {};
-struct Hold {
-  Hold(Mutex&) {}
-};
 #endif
 #if defined(__SSE2__)
 #include <immintrin.h>
@@ -69,7 +55,8 @@ typedef float F __attribute__((vector_size(VECTOR), may_alias));
 typedef float Fu __attribute__((vector_size(VECTOR), may_alias, aligned(4)));
 typedef int32_t I __attribute__((vector_size(VECTOR), may_alias));
 #define ALWAYS static inline __attribute__((always_inline))
-#define OUTLINE static __attribute__((noinline))
+#define OUTLINE static __attribute__((noinline))  // what runs once in a while would fill the instruction cache
+#define API extern "C" __attribute__((visibility("default")))
 
 ALWAYS V splat(Word x) { return x - V{}; }
 ALWAYS F splatf(float x) { return x - F{}; }  // minus keeps -0
