@@ -128,7 +128,8 @@ def add(folder: Path, key: str, code: bytes, name: str) -> Path:
 def entries(folder: Path) -> list[CachedFile]:
     """The files in the cache, most recently used first."""
     stored = []
-    for path in sorted(folder.glob("*/*")):
+    homes = [home for home in folder.iterdir() if HOME.fullmatch(home.name)]  # others may vanish meanwhile
+    for path in sorted(path for home in homes for path in home.glob("*")):
         with suppress(OSError):
             if match := NAME.fullmatch(path.name):
                 status = path.stat()

@@ -11,6 +11,7 @@ import re
 import signal
 import subprocess
 import sys
+import threading
 import time
 from datetime import datetime, timedelta
 from pathlib import Path
@@ -119,6 +120,32 @@ def test_a_cache_that_cannot_be_written_still_serves(tmp_path: Path, monkeypatch
     assert cache.find(tmp_path, "a") == library
 
 
+def test_a_library_that_others_may_load_is_not_removed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    library = put(tmp_path, "a", b"code")
+    monkeypatch.setattr(Path, "unlink", None)
+    assert put(tmp_path, "a", b"code") == library
+
+
+def test_scratch_folders_that_vanish_do_not_stop_anyone(tmp_path: Path) -> None:
+    put(tmp_path, "a", b"code")
+    done = threading.Event()
+
+    def build_and_remove() -> None:
+        while not done.is_set():
+            with scratch_folder(tmp_path):
+                pass
+
+    others = [threading.Thread(target=build_and_remove) for _ in range(2)]
+    for other in others:
+        other.start()
+    try:
+        assert all(len(cache.entries(tmp_path)) == 1 for _ in range(200))
+    finally:
+        done.set()
+
+
 # --- compilers
 
 
@@ -152,7 +179,7 @@ def calls(folder: Path) -> list[str]:
 def test_each_compiler_gets_flags_that_it_takes(
     version: str, family: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setenv("CXX", str(fake(tmp_path, "cc", version)))
+    monkeypatch.setenv("CXX", str(fake(tmp_path, "cxx", version)))
     compiler = find_compiler()
     assert (compiler.family, compiler.version) == (family, version)
     with building(Building("-O1", tmp_path)):
@@ -230,7 +257,7 @@ def test_another_compiler_source_or_level_is_another_library(
 def test_units_are_compiled_side_by_side(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("os.cpu_count", lambda: 2)
     both = f"echo x >> {tmp_path}/there; while [ $(wc -l < {tmp_path}/there) = 1 ]; do sleep 0.1; done"
-    monkeypatch.setenv("CXX", str(fake(tmp_path, "cc", "g++ 1", f'{both}; cp "${{@: -1}}" "$out"')))
+    monkeypatch.setenv("CXX", str(fake(tmp_path, "cxx", "g++ 1", f'{both}; cp "${{@: -1}}" "$out"')))
     with building(Building("-O0", tmp_path)):
         (library,) = build(Source("// source\n", "yard", units=2))
         assert library.read_text() == "// source\n"
@@ -244,7 +271,7 @@ def test_units_are_compiled_side_by_side(tmp_path: Path, monkeypatch: pytest.Mon
 
 def test_a_compiler_that_fails_is_quoted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     body = "echo program.cpp:1: bad >&2; exit 3"
-    monkeypatch.setenv("CXX", str(fake(tmp_path, "cc", "g++ 1", body)))
+    monkeypatch.setenv("CXX", str(fake(tmp_path, "cxx", "g++ 1", body)))
     with building(Building("-O0", tmp_path)), pytest.raises(NoCompiler, match=r"failed:\nprogram.cpp:1: bad"):
         build(Source("// source\n", "yard"))
     assert not [name for name in names(tmp_path) if MARK in name]
@@ -272,7 +299,7 @@ def start(folder: Path, compiler: Path) -> subprocess.Popen[str]:
 
 
 def test_processes_that_want_the_same_compile_it_once(tmp_path: Path) -> None:
-    compiler = fake(tmp_path, "cc", "g++ 1", 'sleep 1; cp "${@: -1}" "$out"')
+    compiler = fake(tmp_path, "cxx", "g++ 1", 'sleep 1; cp "${@: -1}" "$out"')
     running = [start(tmp_path, compiler) for _ in range(5)]
     assert {process.communicate(timeout=120)[0] for process in running} == {"// source\n\n"}
     assert len(calls(tmp_path)) == 1
@@ -282,14 +309,14 @@ def test_processes_that_want_the_same_compile_it_once(tmp_path: Path) -> None:
 @pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGINT])
 def test_a_killed_builder_harms_nobody(tmp_path: Path, how: int) -> None:
     # As compilers do, this one starts another process that does the work.
-    slow = fake(tmp_path, "cc", "g++ 1", f"sleep 1000 & echo $! >> {tmp_path}/workers; wait")
+    slow = fake(tmp_path, "cxx", "g++ 1", f"sleep 1000 & echo $! >> {tmp_path}/workers; wait")
     first = start(tmp_path, slow)
     assert waited(lambda: (tmp_path / "workers").exists() and (tmp_path / "workers").read_text())
     second = start(tmp_path, slow)  # waits for the first one's lock
     worker, compiler = int((tmp_path / "workers").read_text()), int(calls(tmp_path)[0].split()[0])
     assert alive(worker)
     assert alive(compiler)
-    fake(tmp_path, "cc", "g++ 1")
+    fake(tmp_path, "cxx", "g++ 1")
     first.send_signal(how)
     first.communicate(timeout=240)
     if how == signal.SIGINT:
