@@ -16,7 +16,8 @@ ALWAYS V lanes_on(const Context& c, int by) {
   for (int l = 0; l < LANES; l++) number[l] = l;
   return mux(splat(c.g.strips - 1), number + splat(by), number);
 }
-ALWAYS V turned(V v, V lanes) {  // what each lane sees there
+ALWAYS V turned(const Context& c, V v, V lanes) {  // what each lane sees there
+  if (c.g.strips == 1) return v;
 #ifdef SHUFFLES
   return two_of(v, lanes, v);
 #else
@@ -35,7 +36,7 @@ OUTLINE void fill_halo(const Context& c, Plane* p, int rows, bool around) {
       const V lanes = lanes_on(c, by);
       V kept = splat(FULL);
       if (!around) for (int l = 0; l < LANES; l++) kept[l] = (u32)((l & (c.g.strips - 1)) + by) < (u32)c.g.strips ? FULL : 0;
-      for (int w = 0; w < words; w++) to[w] = turned(from[w], lanes) & kept;
+      for (int w = 0; w < words; w++) to[w] = turned(c, from[w], lanes) & kept;
     }
   (around ? p->around : p->beyond) = rows;
 }
@@ -99,11 +100,11 @@ OUTLINE void arrive_over(Context& c, Plane* movers, int dy, int dx, Plane* const
   }
 }
 // Planes that move together, in place.
-// Rows of one word, not in strips: every row that changes is read and written once. What leaves it for the next one waits
-// in a register, and a few planes go together, since each waits for what it reads.
+// Rows of one word: every row that changes is read and written once. What leaves it for the next one waits in a register, and
+// a few planes go together, since each waits for what it reads.
 constexpr int TOGETHER = 4;
 #define EACH_PLANE _Pragma("GCC unroll 4") for (int k = 0; k < N; k++)
-ALWAYS bool near_rows(const Context& c, int dy) { return c.g.words == 1 && c.g.strips == 1 && abs(dy) <= 1; }
+ALWAYS bool near_rows(const Context& c, int dy) { return c.g.words == 1 && abs(dy) <= 1; }
 // `by` columns to the left on the torus.
 template <bool TURNS> ALWAYS V around(const Context& c, V x, int by) {
   return TURNS ? around(c, x, by) : x;
@@ -113,7 +114,7 @@ template <bool TURNS> ALWAYS V around(const Context& c, V x, int by) {
 template <bool ENTERED, bool TURNS> ALWAYS int rows_of(const Context& c, const V* m, int dy, int back) {
   const int height = c.g.height;
   int *rows = c.moving, count = 0;
-  V before = m[dy > 0 ? height - 1 : 0];  // what moves into row y
+  V before = turned(c, m[dy > 0 ? height - 1 : 0], lanes_on(c, -dy));  // what moves into row y
   for (int i = 0, y = dy < 0 ? height - 1 : 0; i < height; i++, y += dy < 0 ? -1 : 1) {
     const V here = m[y], from = dy ? before : here;
     rows[count] = y;
@@ -128,11 +129,13 @@ template <int N, bool TURNS, bool ROWS> OUTLINE void swap_near(const Context& c,
   const int back = c.g.width - by, edge = dy > 0 ? c.g.height - 1 : 0, first = c.g.height - 1 - edge, *rows = c.moving;
   V *data[N], comes[N], last[N];
   EACH_PLANE data[k] = planes[k];
-  if (ROWS)
+  if (ROWS) {
+    const V on = lanes_on(c, dy), from = lanes_on(c, -dy);
     EACH_PLANE {
-      last[k] = (data[k][edge] ^ around<TURNS>(c, data[k][first], by)) & m[edge];
-      comes[k] = around<TURNS>(c, last[k], back);
+      last[k] = (data[k][edge] ^ turned(c, around<TURNS>(c, data[k][first], by), on)) & m[edge];
+      comes[k] = turned(c, around<TURNS>(c, last[k], back), from);
     }
+  }
   const bool wraps = ROWS && count && rows[count - 1] == edge;
   V ahead[N];  // the row after the one that is written
   int loaded = -1;
@@ -164,12 +167,15 @@ struct Left {
 ALWAYS Left left_by(V movers, Leaves leaves) {
   return Left{movers & splat(leaves == NOTHING ? FULL : 0), movers & splat(leaves == EVERYTHING ? FULL : 0)};
 }
-template <int N, bool TURNS, bool ROWS> OUTLINE void arrive_near(const Context& c, V* const* planes, const V* m, int count, int edge, int back, Leaves leaves) {
-  const int* rows = c.moving;
+template <int N, bool TURNS, bool ROWS> OUTLINE void arrive_near(const Context& c, V* const* planes, const V* m, int count, int dy, int back, Leaves leaves) {
+  const int *rows = c.moving, edge = dy > 0 ? c.g.height - 1 : 0;
   const V* entered = c.entered;
   V *data[N], comes[N];
   EACH_PLANE data[k] = planes[k];
-  if (ROWS) EACH_PLANE comes[k] = data[k][edge] & m[edge];
+  if (ROWS) {
+    const V from = lanes_on(c, -dy);
+    EACH_PLANE comes[k] = turned(c, data[k][edge] & m[edge], from);
+  }
   for (int i = 0; i < count; i++) {
     const int y = rows[i];
     const V gone = m[y];
@@ -183,10 +189,10 @@ template <int N, bool TURNS, bool ROWS> OUTLINE void arrive_near(const Context& 
   }
 }
 template <bool TURNS, bool ROWS> ALWAYS void arrive_near_rows(Context& c, V* const* data, int count, const V* m, int dy, int back, Leaves leaves) {
-  const int rows = rows_of<true, TURNS>(c, m, dy, back), edge = dy > 0 ? c.g.height - 1 : 0;
+  const int rows = rows_of<true, TURNS>(c, m, dy, back);
   int k = 0;
-  for (; k + TOGETHER <= count; k += TOGETHER) arrive_near<TOGETHER, TURNS, ROWS>(c, data + k, m, rows, edge, back, leaves);
-  for (; k < count; k++) arrive_near<1, TURNS, ROWS>(c, data + k, m, rows, edge, back, leaves);
+  for (; k + TOGETHER <= count; k += TOGETHER) arrive_near<TOGETHER, TURNS, ROWS>(c, data + k, m, rows, dy, back, leaves);
+  for (; k < count; k++) arrive_near<1, TURNS, ROWS>(c, data + k, m, rows, dy, back, leaves);
 }
 // A row that exchanges with one of other strips, `by` of them on.
 OUTLINE void swap_strips(Context& c, const V* m, V* const* data, int n, int here_row, int there_row, int by, int dx) {
@@ -195,10 +201,10 @@ OUTLINE void swap_strips(Context& c, const V* m, V* const* data, int n, int here
   const V on = lanes_on(c, by), back = lanes_on(c, -by);
   for (int k = 0; k < n; k++) {
     V *here = data[k] + here_row * words, *there = data[k] + there_row * words;
-    for (int w = 0; w < words; w++) seen[w] = turned(there[w], on);
+    for (int w = 0; w < words; w++) seen[w] = turned(c, there[w], on);
     for (int w = 0; w < words; w++) c.change[w] = (here[w] ^ (dx ? columns(c, seen, w, dx) : seen[w])) & m[w];
     for (int w = 0; w < words; w++) here[w] ^= c.change[w];
-    for (int w = 0; w < words; w++) there[w] ^= turned(dx ? columns(c, c.change, w, -dx) : c.change[w], back);
+    for (int w = 0; w < words; w++) there[w] ^= turned(c, dx ? columns(c, c.change, w, -dx) : c.change[w], back);
   }
 }
 // A word's columns, moved by dx: those that stay in the word, and those that come into the next.
@@ -358,10 +364,10 @@ OUTLINE void arrive_planes(Context& c, const Plane* movers, int dy, int dx, Plan
   const V* m = movers->data + edge * words;
   if (!dy || !any_word(m, words)) return;
   const V back = lanes_on(c, -dy);
-  for (int w = 0; w < words; w++) targets[w] = turned(dx ? columns(c, m, w, -dx) : m[w], back);
+  for (int w = 0; w < words; w++) targets[w] = turned(c, dx ? columns(c, m, w, -dx) : m[w], back);
   for (int k = 0; k < n; k++) {
     V* there = data[k] + (dy > 0 ? 0 : height - 1) * words;
-    for (int w = 0; w < words; w++) there[w] = (there[w] & ~targets[w]) | turned(c.late[k * words + w], back);
+    for (int w = 0; w < words; w++) there[w] = (there[w] & ~targets[w]) | turned(c, c.late[k * words + w], back);
   }
 }
 OUTLINE Plane* cleared(Context& c, Plane* old, const Plane* where) {  // old and not where
