@@ -143,7 +143,7 @@ class MixedEnv(CompiledEnv):
         self._most = np.array(self.action_nvec, np.uint64)
         self._envs: dict[int, CompiledEnv] = {}
         self._groups: Groups = {}
-        self._planned: dict[int, Tensor] = {}
+        self._planned: dict[int, Array] = {}
         """By ruleset: the ascending numbers of worlds that will be needed, int64 [n]."""
         self._ahead: dict[int, Episodes] = {}
         """The starts of planned worlds, by ruleset."""
@@ -176,29 +176,29 @@ class MixedEnv(CompiledEnv):
     def _restart(self, mask: Tensor, worlds: Tensor) -> None:
         """Begin episodes where `mask`, bool [B], is set, in the worlds with these numbers, int64 [B]."""
         rows, began = mask.nonzero()[:, 0].numpy(), mask.numpy()
-        numbers = self.program.ruleset_of(worlds).numpy()
-        for number in numbers[rows].tolist():
+        entered, starting = self.program.ruleset_of(worlds).numpy()[rows], worlds.numpy()
+        for number in entered.tolist():
             self._env(number)  # raises before anything has changed
         groups, entering = dict(self._groups), []
-        for number in sorted({*groups, *numbers[rows].tolist()}):
+        for number in sorted({*groups, *entered.tolist()}):
             env, members = groups.get(number, (self._env(number), rows[:0]))
-            leaving, new = (members >= 0) & began[members], rows[numbers[rows] == number]
+            leaving, new = (members >= 0) & began[members], rows[entered == number]
             if not leaving.any() and not len(new):
                 continue
             members = np.where(leaving, -1, members)
             free = np.flatnonzero(members < 0)[: len(new)]
             if self._joint is None or len(free) < len(new) or (self.params and len(new)):
-                members = self._rebuild(number, members, new, worlds)
+                members = self._rebuild(number, members, new, starting)
             elif len(new):
                 members[free] = new
-                entering.append((number, free, worlds[new]))
+                entering.append((number, free, starting[new]))
             groups[number] = env, members
         size = sum(len(members) for _, members in groups.values())
         if self._joint is None or size > MOST_ROWS * self.num_envs:
             groups = {number: group for number, group in groups.items() if (group[1] >= 0).any()}
         self.episodes = self._regroup(dict(sorted(groups.items())), entering)
 
-    def _rebuild(self, number: int, members: Array, new: Array, worlds: Tensor) -> Array:
+    def _rebuild(self, number: int, members: Array, new: Array, worlds: Array) -> Array:
         """Make room for new episodes under a ruleset. Returns the numbers of all its episodes, −1 in idle rows.
 
         `members` are those of its rows so far; the environments `new`, int64 [n], begin in their `worlds`, int64 [B].
@@ -215,7 +215,8 @@ class MixedEnv(CompiledEnv):
         episodes = None
         if len(new):
             ahead, entries = self._starts(number, worlds[new])
-            episodes = env.program.select(ahead, torch.cat([entries, entries[:1].expand(idle)]))
+            entries = np.concatenate([entries, np.full(idle, entries[0])])
+            episodes = env.program.select(ahead, torch.from_numpy(entries))
         if stay:
             assert env.episodes is not None
             places, rest = torch.from_numpy(staying), torch.arange(stay, count + idle)
@@ -229,18 +230,21 @@ class MixedEnv(CompiledEnv):
         env.adopt(episodes, returned, params)
         return members
 
-    def _starts(self, number: int, worlds: Tensor) -> tuple[Episodes, Tensor]:
+    def _starts(self, number: int, worlds: Array) -> tuple[Episodes, Array]:
         """Return starts of episodes under a ruleset, and the places among them of worlds, int64 [n].
 
         If they are planned, these are all planned worlds: a batch of many takes little longer than one of a few.
         """
-        env, planned = self._env(number), self._planned.get(number, worlds[:0])
-        native = env.simulator.native(self.task.size[1])
-        if not bool(torch.isin(worlds, planned).all()):
-            return env.program.start(worlds, native), torch.arange(len(worlds))
-        if number not in self._ahead:
-            self._ahead[number] = env.program.start(planned, native)
-        return self._ahead[number], torch.searchsorted(planned, worlds)
+        planned = self._planned.get(number, worlds[:0])
+        places = np.searchsorted(planned, worlds)
+        known = bool((places < len(planned)).all() and (planned[places] == worlds).all())
+        if not known or number not in self._ahead:
+            env, needed = self._env(number), torch.from_numpy(planned if known else worlds)
+            starts = env.program.start(needed, env.simulator.native(self.task.size[1]))
+            if not known:
+                return starts, np.arange(len(worlds))
+            self._ahead[number] = starts
+        return self._ahead[number], places
 
     def _plan(self, base: Tensor, first: Tensor, depth: int) -> None:
         """Plan the start worlds of `depth` episodes from `first`, int64 [B], on."""
@@ -249,10 +253,10 @@ class MixedEnv(CompiledEnv):
         rulesets = self.program.ruleset_of(worlds)
         numbers, counts = rulesets.unique(return_counts=True)
         parts = worlds[rulesets.argsort(stable=True)].split(counts.tolist())
-        self._planned, self._ahead = dict(zip(numbers.tolist(), parts, strict=True)), {}
+        self._planned, self._ahead = dict(zip(numbers.tolist(), map(Tensor.numpy, parts), strict=True)), {}
         self._planned_from = base, first
 
-    def _regroup(self, groups: Groups, entering: Sequence[tuple[int, Array, Tensor]] = ()) -> Episodes:
+    def _regroup(self, groups: Groups, entering: Sequence[tuple[int, Array, Array]] = ()) -> Episodes:
         """Continue with these groups. Returns their episodes.
 
         `entering`: the ruleset, rows and worlds, int64 [n] each, of episodes that begin in idle rows.

@@ -122,12 +122,6 @@ class OwnedBatch(PackedArrays):
             raise RuntimeError(f"{problem}: only those that came of it can be used")
         return self._handle
 
-    def forget(self) -> None:
-        """Unpack again on the next access. Raises RuntimeError after `take`."""
-        if self._handle is None:
-            _ = self.handle
-        self._arrays.clear()
-
     def take(self) -> int:
         """The batch, for a new owner. This state must not be used afterwards."""
         handle, self._handle = self.handle, None

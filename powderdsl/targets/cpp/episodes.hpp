@@ -174,9 +174,9 @@ static void act(Play& p, Batch& b, const int64_t* actions) {
 // Steps of some worlds, in ascending order, with the clocks and parameters of `p`.
 template <class P> static void run_some(P& p, Batch& b, const std::vector<int>& places, int64_t steps) {
   const size_t count = places.size(), worlds = b.worlds, bits_each = b.program->param_planes, reals_each = b.program->param_reals;
-  if (count == worlds) {
+  if (count + std::count(b.idle.begin(), b.idle.end(), 1) == worlds) {  // all that are not idle
     pd_run(&b, 0, steps, p.threads, p.seed, p.index, p.step, 0, p.own_params, p.param_bits, p.param_reals, nullptr);
-    for (size_t i = 0; i < worlds; i++) p.step[i] += steps;
+    for (int i : places) p.step[i] += steps;
     return;
   }
   Batch* part = (Batch*)pd_new(b.program, count, b.g.world_height(), b.g.width, 0);

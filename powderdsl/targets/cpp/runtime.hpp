@@ -32,24 +32,24 @@ struct Grid {
   bool operator==(const Grid& g) const { return height == g.height && width == g.width && strips == g.strips; }
 };
 
-// A program: what its passes need, as the driver reads it.
+// The sizes and tables of a program, which the driver reads.
 struct ResetPlane { int slot; bool value; };
 struct ResetReal { int slot; float value; };
 struct FixedPlane { int kind, a, b; };
 struct StepPlane { u64 a; int b; };
 struct Context;
 struct Program {
-  int slots, reals, param_planes, param_reals, around_rows, beyond_rows;  // as the halos of a grid
-  int coins, moving, turned, waiting, marks;                              // see NativeLayout of targets/layout.py
+  int slots, reals, param_planes, param_reals;
+  int around_rows, beyond_rows, coins, moving, turned, waiting, marks;  // see NativeLayout of targets/layout.py
   std::vector<ResetPlane> reset_planes;  // slots that a step resets
   std::vector<ResetReal> reset_reals;
-  std::vector<FixedPlane> fixed;  // planes that follow from places
-  std::vector<StepPlane> steps;   // and from the step
-  std::vector<u32> streams;       // the identity of each
-  std::vector<int> elements;      // the slots of the bits of ids
+  std::vector<FixedPlane> fixed;  // planes of coordinates and insides
+  std::vector<StepPlane> steps;   // planes of bits of the step's number
+  std::vector<u32> streams;       // their idents
+  std::vector<int> elements;      // slots of the bits of element ids
   u64 asked;                      // ids whose presence passes test
   void (*run)(Context&);          // all passes
-  std::vector<Context*> contexts;  // between calls: at most a few, of the grids used last
+  std::vector<Context*> contexts;  // free ones: at most a few, of the grids used last
 };
 
 // Everything one thread needs to run groups: buffers, row tables, keys.
@@ -62,7 +62,7 @@ struct Context {
   std::vector<Field*> fields;
   Plane *nothing, *everything;
   Field* calm;  // no row of it is live
-  std::vector<void*> memory;  // of all that follows
+  std::vector<void*> memory;  // of the following arrays
   V* nothing_row;
   V *change, *late;  // two rows of words; a row for each plane that moves
   V **from, **to;    // planes that move
@@ -101,7 +101,8 @@ struct Context {
   const int* rows() const { return wrapped.data() + HALO; }
 };
 
-// What passes call. It is the driver's, which all programs share unless all is in one file; pd_program tells where it is.
+// Functions of the driver that passes call: through pointers, which pd_program sets, or directly in a file that also has the
+// driver.
 enum Leaves { NOTHING, EVERYTHING, SAME };  // what movers leave behind
 #define SHARED(EACH) \
   EACH(Plane*, take, Context& c) \
