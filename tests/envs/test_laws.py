@@ -55,7 +55,7 @@ fill: empty
 generate:
   - disk crust at (4..12, 4..12) radius 4
   - disk (pool, grain) at (3..12, 3..12) radius 2
-agent: {may: any, actions: 6, steps_per_action: 2}
+agent: {may: any, actions: 6, steps_per_action: 2, free_steps: 3}
 reward: {each: change(-count(crust)) / 10}
 end: {success: count(crust) < 12}
 expert:
