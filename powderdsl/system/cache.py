@@ -115,7 +115,7 @@ def add(folder: Path, key: str, code: bytes, name: str) -> Path:
     name = re.sub(r"[^\w.+]", "_", name)[:80] or "?"
     path = home / f"{key}-{hashlib.sha256(code).hexdigest()}-{name}"
     for other in sorted(home.glob(f"{key}-*")):
-        if other != path:  # which another process may have added, and load now
+        if other != path:  # another process may be loading this one
             other.unlink(missing_ok=True)
     with scratch_folder(folder) as scratch:
         (scratch / "code").write_bytes(code)

@@ -206,33 +206,33 @@ class Source(NamedTuple):
 def build(*sources: Source) -> list[Path]:
     """The paths of the libraries of sources, compiled side by side unless they are in the cache.
 
-    Safe with other processes and threads that do the same: one of them compiles the first source, and libraries are added
-    atomically. Damaged libraries are compiled again. Raises NoCompiler if none was found, or it failed.
+    Safe with other processes and threads that do the same: only one of them compiles the first source, and libraries
+    are added atomically. Damaged libraries are compiled again. Raises NoCompiler if none was found, or it failed.
     """
     compiler, how = find_compiler(), current()
     flags, folder = flags_for(compiler, how.level), how.place()
-    keys = {cache_key(source.text, compiler, flags): source for source in sources}
-    paths = {key: cache.find(folder, key) for key in keys}
+    by_key = {cache_key(source.text, compiler, flags): source for source in sources}
+    paths = {key: cache.find(folder, key) for key in by_key}
     if None in paths.values():
-        with turn(folder, next(iter(keys))):
-            paths = {key: cache.find(folder, key) for key in keys}
+        with turn(folder, next(iter(by_key))):
+            paths = {key: cache.find(folder, key) for key in by_key}
             new = [key for key, path in paths.items() if path is None]
             try:
-                codes = _compile([*compiler.command, *flags], [keys[key] for key in new], folder)
+                codes = _compile([*compiler.command, *flags], [by_key[key] for key in new], folder)
                 for key, code in zip(new, codes, strict=True):
-                    paths[key] = cache.add(folder, key, code, keys[key].name)
+                    paths[key] = cache.add(folder, key, code, by_key[key].name)
             except OSError as error:
                 raise NoCompiler(f"no room for compiled code: {error}") from None
     return [path for path in paths.values() if path is not None]
 
 
 def _compile(command: list[str], sources: Sequence[Source], folder: Path) -> list[bytes]:
-    """The libraries of sources; all units are compiled side by side."""
+    """The libraries of sources, which contain the names of their files. All units are compiled side by side."""
     with scratch_folder(folder) as scratch:
         compilers, linkers, libraries = [], [], []
         for number, (text, _, units) in enumerate(sources):
             (home := scratch / f"{number}").mkdir()
-            library, file = home / "library", home / "program.cpp"  # whose name is in the library
+            library, file = home / "library", home / "program.cpp"
             libraries.append(library)
             file.write_text(text, encoding="utf-8")
             if units == 1 or os.cpu_count() == 1:
@@ -318,7 +318,7 @@ SIGNATURES = {
     "pd_choose": "- ppp",
     "pd_observe": "- ppi",
 }
-"""The result and the arguments of the function of a program's library, and those of its driver's, by letters of `_TYPES`."""
+"""The results and arguments of `pd_program`, in programs' libraries, and of the driver's functions, by letters of `_TYPES`."""
 
 
 @lru_cache(maxsize=64)

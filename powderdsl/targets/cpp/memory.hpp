@@ -70,29 +70,18 @@ static void drop(const Grid& g, Plane* p) { drop(spare_planes, p, plane_size(g))
 static void drop(const Grid& g, Field* f) { drop(spare_fields, f, field_size(g)); }
 
 OUTLINE void put(Context& c, Plane* p) { c.planes.push_back(p); }
+template <class T> ALWAYS T* taken(const Grid& g, std::vector<T*>& free, T* (*make)(const Grid&)) {
+  T* t = free.empty() ? make(g) : free.back();
+  if (!free.empty()) free.pop_back();
+  t->refs = 1;
+  return t;
+}
 OUTLINE Plane* take(Context& c) {
-  Plane* p;
-  if (c.planes.empty()) {
-    p = new_plane(c.g);
-  } else {
-    p = c.planes.back();
-    c.planes.pop_back();
-  }
-  p->refs = 1;
+  Plane* p = taken(c.g, c.planes, new_plane);
   p->around = p->beyond = 0;
   return p;
 }
-OUTLINE Field* take_field(Context& c) {
-  Field* f;
-  if (c.fields.empty()) {
-    f = new_field(c.g);
-  } else {
-    f = c.fields.back();
-    c.fields.pop_back();
-  }
-  f->refs = 1;
-  return f;
-}
+OUTLINE Field* take_field(Context& c) { return taken(c.g, c.fields, new_field); }
 // A plane of this owner alone, to be written over.
 OUTLINE void own_plane(Context& c, Plane*& p) {
   if (p != c.nothing && p != c.everything && p->refs == 1) {

@@ -279,23 +279,11 @@ OUTLINE void swap_planes(Context& c, const Plane* movers, int dy, int dx, Plane*
     }
   }
 }
-// Movers go to their targets, at most a row away. A cell that is both holds what arrives: each row is read before
-// anything arrives there, and what goes around the edge arrives last.
+// Rows of several words: movers go to their targets, at most a row away. A cell that is both holds what arrives: each row is
+// read before anything arrives there, and what goes around the edge arrives last.
 template <bool AROUND>
 ALWAYS void arrive_row(const Context& c, V* const* data, int count, int here, int there, const V* m, const V* targets, int dx, Leaves leaves) {
-  const int words = c.g.words, by = c.turn(-dx), back = c.g.width - by;
-  if (__builtin_expect(words == 1, 1)) {
-    const V gone = m[0], keeps = ~targets[0];
-    const Left rest = left_by(gone, leaves);
-    for (int k = 0; k < count; k++) {
-      const V a = data[k][here], moving = a & gone;
-      const V arriving = by ? around(c, moving, by) : moving;
-      data[k][here] = (a & ~rest.clears) | rest.sets;
-      if (AROUND) c.late[k] = arriving;
-      else data[k][there] = (data[k][there] & keeps) | arriving;
-    }
-    return;
-  }
+  const int words = c.g.words;
   if (here != there && abs(dx) <= c.rest) {
     if (AROUND) memset(c.late, 0, sizeof(V) * count * words);
     for (int w = 0; w < words && !AROUND; w++) {

@@ -32,8 +32,7 @@ ALWAYS const V* row_or_nothing(const Context& c, const Plane* p, int y) {
 }
 
 ALWAYS int strips_on(const Context& c, int y) {  // how many strips below its own the row y of a strip lies
-  if (y < 0) return y >= -c.g.height ? -1 : -((c.g.height - 1 - y) / c.g.height);
-  return y < c.g.height ? 0 : y < 2 * c.g.height ? 1 : y / c.g.height;
+  return y >= 0 ? y / c.g.height : -((c.g.height - 1 - y) / c.g.height);
 }
 // To be called before rows of other strips are read, up to `rows` away.
 ALWAYS void edges(const Context& c, Plane* p, int rows) {
