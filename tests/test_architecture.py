@@ -26,7 +26,7 @@ MAP = ROOT / "docs" / "architecture.md"
 MADE_FOLDERS = ("web/made", "web/parts")
 """Folders that `make web` and `make wheel` write, and git ignores."""
 MAX_LINES = 800
-LINE_BUDGET = 58_842
+LINE_BUDGET = 58_873
 """Lines of Python that powderdsl/ may have."""
 
 EMPTY_NAMES = ("utils", "util", "common", "helpers", "helper", "base", "misc")

@@ -158,7 +158,7 @@ class Stepper(Plan):
         chosen, simulator = params_of(episodes, params), self.program.simulator
         self._params = simulator.parameters(chosen, worlds) if chosen else simulator.defaults(worlds)
         inputs = self.native.inputs(self._params, worlds)
-        if episodes.params:  # `_copy_maps` writes to them
+        if episodes.params:  # `copy_maps` writes to them
             bits, reals = (part.repeat(worlds // len(part), 1) for part in inputs[1:])
             inputs = inputs._replace(bits=bits, reals=reals)
         self._inputs = inputs
@@ -166,6 +166,7 @@ class Stepper(Plan):
             self.filled, self._ahead = torch.zeros(worlds, dtype=torch.int64), None
         self.read_from(np.empty((worlds, self.play.numbers), np.int64))
         self._results: Results | None = None
+        self.play.entry = self.play.places = 0
         self._tensors: dict[str, Tensor] = {
             **tensors,
             **kept,
@@ -184,10 +185,10 @@ class Stepper(Plan):
         if results is not self._results:
             for name, address in results.addresses.items():
                 setattr(self.play, name, address)
-            self._results = results
+            self._results, self.play.rows = results, len(results.observed)
 
     def read_from(self, numbers: Any) -> None:
-        """Let the next calls read actions from an array, int64 [B, k]."""
+        """Let the next calls read actions from an array, int64 [n, k]."""
         self.numbers, self._numbers_at = numbers, numbers.ctypes.data
 
     def step(self) -> int:
@@ -199,7 +200,7 @@ class Stepper(Plan):
         if not self.measures_cells:
             status: int = library.pd_play(play, address)
             if status == READY and self._has_maps:
-                self._copy_maps()
+                self.copy_maps()
             return status
         status = library.pd_act(play, address)
         if status >= 0:
@@ -213,26 +214,23 @@ class Stepper(Plan):
         self.begin()
         return READY
 
-    def rest(self, idle: Any) -> None:
-        """Let the next calls skip the episodes where `idle`, bool [B], is set."""
-        self.prepare()
-        self.native.library.pd_rest(self.play.batch, idle.ctypes.data)
+    def share(self, places: Any, entry: Any, begins: Any) -> None:
+        """Let the next calls read from arrays, [B] each, until it is bound anew.
 
-    def enter(self, ahead: Episodes, places: Any, rows: Any) -> None:
-        """Begin the episodes `places` of `ahead` in some rows, int64 [n] each, and write observations."""
-        if ahead is not self._ahead:
-            self._draw_from(ahead)
-        entry, begins = np.zeros(len(self.begins), np.int64), self.begins.numpy()
-        entry[rows], begins[rows] = places, True
-        self._entry, self.play.entry = torch.from_numpy(entry), entry.ctypes.data
-        self.begin()
-        begins[rows] = False
+        Args:
+            places: int64: the places of actions and results; −1: the episode is idle. A call of `begin` notices changes.
+            entry: int64: the start worlds of the next episodes among those of `draw_from`.
+            begins: bool: the episodes that begin.
+        """
+        self._places, self._entry, self.begins = map(torch.from_numpy, (places, entry, begins))
+        for name, tensor in (("places", self._places), ("entry", self._entry), ("begins", self.begins)):
+            setattr(self.play, name, tensor.data_ptr())
 
     def begin(self) -> None:
         """Begin the next episodes where `begins` is set, and write observations."""
         self.prepare()
         self.native.library.pd_begin(self._play)
-        self._copy_maps()
+        self.copy_maps()
 
     def prepare(self) -> None:
         """Let the library write to the worlds. Raises RuntimeError if they were stepped with `reuse`."""
@@ -245,16 +243,16 @@ class Stepper(Plan):
         return self.episodes.world.state  # type: ignore[return-value]
 
     @property
-    def call(self) -> tuple[int, int, int]:
-        """The addresses of `pd_play`, of its `Play` and of the actions."""
+    def call(self) -> tuple[int, int]:
+        """The addresses of `pd_play` and of its `Play`."""
         function = ctypes.cast(self.native.library.pd_play, ctypes.c_void_p).value
-        return function or 0, ctypes.addressof(self.play), self._numbers_at
+        return function or 0, ctypes.addressof(self.play)
 
     def _own(self, regions: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """Return the regions that differ between worlds."""
         return {name: cells for name, cells in regions.items() if name not in self.program.fixed}
 
-    def _copy_maps(self) -> None:
+    def copy_maps(self) -> None:
         """Copy the regions, targets and parameters of episodes that have begun."""
         if not self._has_maps or self._ahead is None or not bool(self.begins.any()):
             return
@@ -298,10 +296,12 @@ class Stepper(Plan):
         if self._ahead is not None:
             ahead = self.program.put(self._ahead, places[order], ahead, reuse=True)
         self.filled.copy_(end)
-        self._draw_from(ahead)
+        self.draw_from(ahead)
 
-    def _draw_from(self, ahead: Episodes) -> None:
-        """Let episodes begin in start worlds of a pool."""
+    def draw_from(self, ahead: Episodes) -> None:
+        """Let episodes begin in these start worlds."""
+        if ahead is self._ahead:
+            return
         self._ahead, self._pool = ahead, (state := self.native.pack(ahead.world.state))
         self.play.pool, self.play.pool_world = state.handle, ahead.seed.data_ptr()
         self.play.pool_start, self.play.pool_sizes = ahead.start.data_ptr(), ahead.masks.sizes.data_ptr()
@@ -364,7 +364,8 @@ class CompiledEnv(TensorEnv):
         stepper.begins.copy_(mask)
         stepper.fill(self._numbers)
         self._ended &= ~mask
-        results = self._new_results(stepper)
+        results = self._new_results()
+        stepper.write_to(results)
         stepper.begin()
         self._write_laws(results, None)
         info: Info = {"success": nobody, "_success": nobody.clone()}
@@ -389,7 +390,7 @@ class CompiledEnv(TensorEnv):
         assert self._base is not None
         return world_seeds(self._base[rows], episodes, self.worlds)
 
-    def _new_results(self, stepper: Stepper) -> Results:
+    def _new_results(self) -> Results:
         """Return unreferenced results for the next call to write to."""
         for results in self._results:
             if results.is_free():
@@ -402,7 +403,6 @@ class CompiledEnv(TensorEnv):
             del shown
             results.watch()
             self._results = (results, *self._results[:2])
-        stepper.write_to(results)
         return results
 
     def step(self, actions: Any) -> tuple[Tensor, Tensor, Tensor, Tensor, Info]:
@@ -423,7 +423,8 @@ class CompiledEnv(TensorEnv):
         self._read(actions, self._places)
         if self.autoreset_mode is AutoresetMode.DISABLED and np.count_nonzero(self._waiting):
             check_going(self._ended)
-        results = self._new_results(stepper)
+        results = self._new_results()
+        stepper.write_to(results)
         status = stepper.step()
         if status >= 0:
             self.action_form.decode(actions)  # raises ValueError
@@ -431,12 +432,15 @@ class CompiledEnv(TensorEnv):
         if status == EMPTY:
             stepper.fill(self._numbers)
             stepper.begin()
-        info, ended = results.info.copy(), results.ended
-        self._write_laws(results, ended)
+        self._write_laws(results, results.ended)
+        return self._steps(results, stepper.play.ended)
+
+    def _steps(self, results: Results, ended: int) -> Steps:
+        """What `step_arrays` returns, when some episodes have ended."""
+        info = results.info.copy()
         if results.last_observed is not None:
-            info["final_info"] = results.final_info.copy()
-            info["final_obs"] = results.last_observed[: stepper.play.ended]
-            info["_final_obs"] = info["_final_info"] = ended
+            info["final_info"], info["final_obs"] = results.final_info.copy(), results.last_observed[:ended]
+            info["_final_obs"] = info["_final_info"] = results.ended
         if self.shows_mask:
             info["action_mask"] = self.action_masks().to(torch.int8).numpy()
             info["_action_mask"] = results.everyone

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import operator
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -15,7 +14,7 @@ from torch import Tensor
 
 from powderdsl.envs.compiled import CompiledEnv, Stepper, Steps, episodes_ahead, tensors_of
 from powderdsl.envs.tensor_env import Info
-from powderdsl.tasks.compiled import Results, ReusedArray
+from powderdsl.tasks.compiled import Results
 from powderdsl.tasks.episodes import Episodes, TaskProgram, load_program
 from powderdsl.tasks.mixed import MixedEpisodes
 from powderdsl.tasks.task import Task
@@ -33,89 +32,98 @@ def environment(task: str | Path | Task | TaskProgram, num_envs: int = 1, **how:
     return (MixedEnv if program.is_mixed else CompiledEnv)(program, num_envs, **how)
 
 
-MOST_ROWS = 4
+MOST_ROWS = 6
 """Maximum number of rows per environment, including idle ones."""
 
-COLUMNS = ("observed", "reward", "terminated", "truncated", "success", "episode_return", "episode_length")
-"""The results of a step, one row per episode: names of `Results`."""
+COLUMNS = ("reward", "terminated", "truncated", "success", "episode_return", "episode_length")
+"""Results of a step that are 0 while an episode waits: names of `Results`."""
 
 
 class Joint:
-    """Steps the episodes of several steppers in one call, into shared memory.
+    """Steps the episodes of several steppers in one call, with shared results.
 
     Args:
         steppers: in order. The rows of their episodes follow one another.
-        shape: of one observation.
-        dtype: of observations.
+        members: the number of the episode in each row, int64 [n]; −1: the row is idle. `begin` changes them.
+        actions: where to read actions, int64 [B, k].
+        results: where to write what they observe first.
     """
 
-    def __init__(self, steppers: Sequence[Stepper], shape: tuple[int, ...], dtype: Any):
-        self._steppers, sizes = steppers, [len(stepper.begins) for stepper in steppers]
-        ends = np.cumsum([0, *sizes])
-        self._numbers = np.zeros((ends[-1], steppers[0].play.numbers), np.int64)
-        self.observed = np.zeros((ends[-1], *shape), dtype)
-        """The last observations of all rows."""
-        self._shown: list[ReusedArray] = []
-        memory = np.empty(int(Results.SIZE * ends[-1]), np.uint8)
-        columns: list[list[Array]] = [[] for _ in COLUMNS[1:]]
-        for stepper, start, end in zip(steppers, ends, ends[1:], strict=False):
-            part = Results(memory[Results.SIZE * start : Results.SIZE * end], self.observed[start:end])
-            stepper.write_to(part)
-            stepper.read_from(self._numbers[start:end])
+    def __init__(self, steppers: Sequence[Stepper], members: Array, actions: Array, results: Results):
+        self._steppers, self._members, self._actions = steppers, members, actions
+        sizes = [len(stepper.begins) for stepper in steppers]
+        self._parts = np.repeat(np.arange(len(sizes)), sizes)
+        """The number of the stepper of each row, int64 [n]."""
+        self._entry, self._begins = np.zeros(len(members), np.int64), np.zeros(len(members), bool)
+        shared = [np.split(all_rows, np.cumsum(sizes)) for all_rows in (members, self._entry, self._begins)]
+        for stepper, *rows in zip(steppers, *shared, strict=False):
+            stepper.read_from(actions)
+            stepper.write_to(results)
+            stepper.share(*rows)
             stepper.begin()
-            for column, name in zip(columns, COLUMNS[1:], strict=True):
-                column.append(getattr(part, name))
-        self._columns = [(memory.view(column[0].dtype), _places(memory, column)) for column in columns]
-        self._bound = [stepper.episodes for stepper in steppers]
-        self._calls = np.array([stepper.call for stepper in steppers], np.int64)
+        self._play_all = steppers[0].native.library.pd_play_all
+        self._states = [stepper.state for stepper in steppers]
+        self._calls = np.array([stepper.call for stepper in steppers], np.int64).T
+        self._apart = np.array([stepper.measures_cells for stepper in steppers])
+        self._arrange()
 
-    def has(self, steppers: Sequence[Stepper]) -> bool:
-        """True if these are its steppers, and none has been bound to other episodes."""
-        bound = [stepper.episodes for stepper in steppers]
-        return len(bound) == len(self._bound) and all(map(operator.is_, bound, self._bound))
-
-    def seat(self, members: Sequence[Array], rows: Array) -> None:
-        """Continue with the episodes of these numbers in the rows of each stepper, int64 [n]; −1: the row is idle.
-
-        `rows`: the row of each episode, int64 [B].
-        """
-        self.rows = rows
-        self._places = [(values, places[rows]) for values, places in self._columns]
-        busy = np.array([bool((own >= 0).any()) for own in members])
+    def _arrange(self) -> None:
+        """Find the steppers whose episodes are not all idle."""
+        busy = self._of(self._members >= 0)
+        self._together = np.compress(busy & ~self._apart, self._calls, 1)
+        self._alone = [self._steppers[part] for part in np.flatnonzero(busy & self._apart).tolist()]
         threads = self._steppers[0].native.threads
         self._threads = threads if busy.sum() >= threads else 1
-        for stepper, own in zip(self._steppers, members, strict=True):
-            stepper.rest(own < 0)
+        for stepper in self._steppers if threads > 1 else ():
             stepper.play.threads = threads // self._threads
-        self._states = [stepper.state for stepper in self._steppers]
-        together = busy & [not stepper.measures_cells for stepper in self._steppers]
-        self._together = np.ascontiguousarray(self._calls[together].T)
-        self._apart = [self._steppers[int(place)] for place in np.flatnonzero(busy & ~together)]
 
-    def step(self, actions: Array) -> list[Array]:
-        """Step all episodes: the columns of `COLUMNS`, in the order of their numbers."""
-        self._numbers[self.rows] = actions.reshape(len(self.rows), -1)
-        for state in self._states:  # faster than `prepare`, which `seat` has called
-            state.forget()
-        addresses = [row.ctypes.data for row in self._together]
-        self._steppers[0].native.library.pd_play_all(self._together.shape[1], *addresses, self._threads)
-        for stepper in self._apart:
+    def _of(self, rows: Array) -> Array:
+        """The steppers of some rows, bool [k]."""
+        return np.bincount(self._parts[rows], minlength=len(self._steppers)) > 0
+
+    def room(self, members: Array, parts: Array) -> Array | None:
+        """Return an idle row for a new episode of each of these steppers, int64 [n]; None if there are too few.
+
+        `members`: as above, when some episodes have left.
+        """
+        order, idle = np.argsort(parts, kind="stable"), np.flatnonzero(members < 0)
+        parts, own = parts[order], self._parts[idle]
+        places = np.searchsorted(own, parts) + np.arange(len(parts)) - np.searchsorted(parts, parts)
+        if len(places) and (places.max() >= len(idle) or (own[places] != parts).any()):
+            return None
+        rows = np.empty_like(order)
+        rows[order] = idle[places]
+        return rows
+
+    def begin(self, members: Array, rows: Array, entries: Array, results: Results) -> None:
+        """Continue with other members, and write to results what they observe.
+
+        The members of some rows begin, in start worlds with these numbers, int64 [n] each.
+        """
+        changed = members != self._members
+        changed[rows] = self._begins[rows] = True
+        self._entry[rows], self._members[:] = entries, members
+        self._arrange()
+        parts = self._of(changed)
+        self._call(np.compress(parts, self._calls, 1), None, results)
+        for part in np.flatnonzero(parts).tolist():
+            self._steppers[part].copy_maps()
+        self._begins[rows] = False
+
+    def step(self, results: Results) -> None:
+        """Step all episodes."""
+        self._call(self._together, self._actions.ctypes.data, results)
+        for stepper in self._alone:
+            stepper.write_to(results)
             stepper.step()
-        shown = next(filter(ReusedArray.is_free, self._shown), None)
-        if shown is None:
-            shown = ReusedArray((len(self.rows), *self.observed.shape[1:]), self.observed.dtype)
-            self._shown = [shown, *self._shown[:2]]
-        # Other modes make another copy.
-        np.take(self.observed, self.rows, 0, shown.rows, mode="clip")
-        return [shown.rows, *(values[places] for values, places in self._places)]
 
-
-def _places(memory: Array, parts: Sequence[Array]) -> Array:
-    """The places of the parts' numbers in some memory that is seen as numbers of their dtype: int64 [B]."""
-    start = memory.ctypes.data
-    return np.concatenate(
-        [(part.ctypes.data - start) // part.itemsize + np.arange(len(part)) for part in parts]
-    )
+    def _call(self, calls: Array, actions: int | None, results: Results) -> None:
+        """Call functions with their arguments, int64 [2, n]; without the address of actions, to begin episodes."""
+        for state in self._states:  # faster than `prepare`
+            state.forget()
+        functions, count, addresses = calls.ctypes.data, calls.shape[1], results.addresses
+        memory = addresses["results"], addresses["observed"]
+        self._play_all(count, functions, functions + 8 * count, actions, *memory, self._threads)
 
 
 Groups = dict[int, tuple[CompiledEnv, Array]]
@@ -143,8 +151,12 @@ class MixedEnv(CompiledEnv):
         self._most = np.array(self.action_nvec, np.uint64)
         self._envs: dict[int, CompiledEnv] = {}
         self._groups: Groups = {}
-        self._planned: dict[int, Array] = {}
-        """By ruleset: the ascending numbers of worlds that will be needed, int64 [n]."""
+        self._members = np.empty(0, np.int64)
+        """The rows of all groups, one after another, int64 [n]: see `Joint`."""
+        self._needed: dict[int, Tensor] = {}
+        """By ruleset: the ascending numbers of planned worlds, int64 [n]."""
+        self._planned = np.array([-1]), np.array([0])
+        """All planned worlds in ascending order, and their numbers among those of their ruleset: int64 [n] each."""
         self._ahead: dict[int, Episodes] = {}
         """The starts of planned worlds, by ruleset."""
         self._planned_from: tuple[Tensor, Tensor] | None = None
@@ -173,50 +185,80 @@ class MixedEnv(CompiledEnv):
 
     # Beginning
 
-    def _restart(self, mask: Tensor, worlds: Tensor) -> None:
-        """Begin episodes where `mask`, bool [B], is set, in the worlds with these numbers, int64 [B]."""
-        rows, began = mask.nonzero()[:, 0].numpy(), mask.numpy()
-        entered, starting = self.program.ruleset_of(worlds).numpy()[rows], worlds.numpy()
-        for number in entered.tolist():
+    def _restart(self, mask: Tensor, worlds: Tensor, results: Results | None = None) -> None:
+        """Begin episodes where `mask`, bool [B], is set, in the worlds with these numbers; `results`: see `Joint`."""
+        results = results or self._new_results()
+        envs = mask.nonzero()[:, 0].numpy()
+        numbers, entries = self.program.ruleset_of(worlds[mask]).numpy(), self._entries(worlds[mask])
+        for number in np.unique(numbers).tolist():
             self._env(number)  # raises before anything has changed
-        groups, entering = dict(self._groups), []
-        for number in sorted({*groups, *entered.tolist()}):
-            env, members = groups.get(number, (self._env(number), rows[:0]))
-            leaving, new = (members >= 0) & began[members], rows[entered == number]
-            if not leaving.any() and not len(new):
-                continue
-            members = np.where(leaving, -1, members)
-            free = np.flatnonzero(members < 0)[: len(new)]
-            if self._joint is None or len(free) < len(new) or (self.params and len(new)):
-                members = self._rebuild(number, members, new, starting)
-            elif len(new):
-                members[free] = new
-                entering.append((number, free, starting[new]))
-            groups[number] = env, members
-        size = sum(len(members) for _, members in groups.values())
-        if self._joint is None or size > MOST_ROWS * self.num_envs:
-            groups = {number: group for number, group in groups.items() if (group[1] >= 0).any()}
-        self.episodes = self._regroup(dict(sorted(groups.items())), entering)
+        members = np.where((self._members >= 0) & mask.numpy()[self._members], -1, self._members)
+        while not self._enter(members, envs, numbers, entries, results):
+            self._make_room(members, envs, numbers, entries, results)
+            members, waiting = self._members, ~np.isin(envs, self._members)
+            envs, numbers, entries = envs[waiting], numbers[waiting], entries[waiting]
 
-    def _rebuild(self, number: int, members: Array, new: Array, worlds: Array) -> Array:
+    def _enter(self, members: Array, envs: Array, numbers: Array, entries: Array, results: Results) -> bool:
+        """Begin episodes in idle rows of `members`. Returns False, and begins none, if there are too few.
+
+        The environments `envs` begin under the rulesets `numbers`, in start worlds with the numbers `entries`: int64
+        [n] each.
+        """
+        if not len(envs):
+            return True
+        joint, known = self._joint, np.array([*self._groups])
+        if joint is None or self._has_params() or not np.isin(numbers, known).all():
+            return False
+        rows = joint.room(members, np.searchsorted(known, numbers))
+        if rows is None:
+            return False
+        for number in np.unique(numbers).tolist():
+            stepper = self._groups[number][0]._stepper
+            assert stepper is not None
+            stepper.draw_from(self._starts(number))
+        members[rows] = envs
+        joint.begin(members, rows, entries, results)
+        self._join()
+        return True
+
+    def _has_params(self) -> bool:
+        """True if parameters have been set for some episodes, before or after the next reset."""
+        return bool(self.params) or any(env.params for env, _ in self._groups.values())
+
+    def _make_room(
+        self, members: Array, envs: Array, numbers: Array, entries: Array, results: Results
+    ) -> None:
+        """Begin episodes under the rulesets that have too few idle rows. Arguments are those of `_enter`."""
+        joint, ends = self._joint, np.cumsum([len(rows) for _, rows in self._groups.values()])
+        held = dict(zip(self._groups, np.split(members, ends), strict=False))
+        for number in sorted({*held, *numbers.tolist()}):
+            own, new = held.get(number, envs[:0]), numbers == number
+            idle = np.count_nonzero(own < 0)
+            if idle < new.sum() or (idle and joint is None) or (new.any() and self._has_params()):
+                held[number] = self._rebuild(number, own, envs[new], entries[new])
+        if joint is None or sum(map(len, held.values())) > MOST_ROWS * self.num_envs:
+            held = {number: rows for number, rows in held.items() if (rows >= 0).any()}
+        self._regroup({number: (self._env(number), held[number]) for number in sorted(held)}, results)
+
+    def _rebuild(self, number: int, members: Array, new: Array, entries: Array) -> Array:
         """Make room for new episodes under a ruleset. Returns the numbers of all its episodes, −1 in idle rows.
 
-        `members` are those of its rows so far; the environments `new`, int64 [n], begin in their `worlds`, int64 [B].
+        `members` are those of its rows so far; the environments `new` begin in the start worlds `entries`, int64 [n]
+        each.
         """
         env, staying = self._env(number), np.flatnonzero(members >= 0)
         stay, count, idle, env.running = len(staying), len(staying) + len(new), 0, 0
         if env.simulator.native(self.task.size[1]) is not None:
             usual = self.num_envs // len(self.program.rulesets)
-            idle = max(usual + 3 * math.isqrt(usual), count + count // 4) - count
+            idle = max(usual + 4 * math.isqrt(usual), count + count // 4) - count
             env.running = max(usual, count // 2, 1)
         members = np.concatenate([members[staying], new, np.full(idle, -1)])
         if not count:
             return members
         episodes = None
         if len(new):
-            ahead, entries = self._starts(number, worlds[new])
             entries = np.concatenate([entries, np.full(idle, entries[0])])
-            episodes = env.program.select(ahead, torch.from_numpy(entries))
+            episodes = env.program.select(self._starts(number), torch.from_numpy(entries))
         if stay:
             assert env.episodes is not None
             places, rest = torch.from_numpy(staying), torch.arange(stay, count + idle)
@@ -225,64 +267,62 @@ class MixedEnv(CompiledEnv):
         assert episodes is not None
         known = {param.name for param in env.task.ruleset.params}
         params = {name: value[members] for name, value in self.params.items() if name in known}
-        returned = self._returned[members]
-        returned[stay:] = 0
+        returned = torch.zeros(len(members), dtype=torch.float64)
+        returned[:stay] = env.returns[staying]
         env.adopt(episodes, returned, params)
         return members
 
-    def _starts(self, number: int, worlds: Array) -> tuple[Episodes, Array]:
-        """Return starts of episodes under a ruleset, and the places among them of worlds, int64 [n].
-
-        If they are planned, these are all planned worlds: a batch of many takes little longer than one of a few.
-        """
-        planned = self._planned.get(number, worlds[:0])
-        places = np.searchsorted(planned, worlds)
-        known = bool((places < len(planned)).all() and (planned[places] == worlds).all())
-        if not known or number not in self._ahead:
-            env, needed = self._env(number), torch.from_numpy(planned if known else worlds)
-            starts = env.program.start(needed, env.simulator.native(self.task.size[1]))
-            if not known:
-                return starts, np.arange(len(worlds))
-            self._ahead[number] = starts
-        return self._ahead[number], places
-
-    def _plan(self, base: Tensor, first: Tensor, depth: int) -> None:
-        """Plan the start worlds of `depth` episodes from `first`, int64 [B], on."""
-        episodes = first + torch.arange(depth)[:, None]
-        worlds = self._choose(base.expand_as(episodes).flatten(), episodes.flatten()).unique()
-        rulesets = self.program.ruleset_of(worlds)
-        numbers, counts = rulesets.unique(return_counts=True)
-        parts = worlds[rulesets.argsort(stable=True)].split(counts.tolist())
-        self._planned, self._ahead = dict(zip(numbers.tolist(), map(Tensor.numpy, parts), strict=True)), {}
-        self._planned_from = base, first
-
-    def _regroup(self, groups: Groups, entering: Sequence[tuple[int, Array, Array]] = ()) -> Episodes:
-        """Continue with these groups. Returns their episodes.
-
-        `entering`: the ruleset, rows and worlds, int64 [n] each, of episodes that begin in idle rows.
-        """
-        self._groups, members = groups, [rows for _, rows in groups.values()]
-        steppers = [env._ready() for env, _ in groups.values()]
+    def _regroup(self, groups: Groups, results: Results) -> None:
+        """Continue with the episodes of these groups, and write what they observe to `results`."""
+        envs, rows = zip(*groups.values(), strict=True)
+        self._members = np.concatenate(rows)
+        parts = np.split(self._members, np.cumsum([*map(len, rows)]))
+        self._groups = dict(zip(groups, zip(envs, parts, strict=False), strict=True))
+        steppers = [env._ready() for env in envs]
         ready = [stepper for stepper in steppers if stepper is not None]
-        if len(ready) < len(steppers):
-            self._joint = None
-            for env, _ in groups.values():
+        self._joint = None
+        if len(ready) == len(steppers):
+            self._joint = Joint(ready, self._members, self._actions.reshape(self.num_envs, -1), results)
+        else:
+            for env in envs:
                 env.unbind()  # from the memory that steppers shared
-        elif self._joint is None or not self._joint.has(ready):
-            space = self.observation.space
-            self._joint = Joint(ready, space.shape, space.dtype)
-        numbers = np.concatenate(members)
-        self._order = np.argsort(numbers, kind="stable")[np.count_nonzero(numbers < 0) :]
-        if self._joint is not None:
-            self._joint.seat(members, self._order)
-        for number, rows, worlds in entering:
-            stepper, (ahead, entries) = groups[number][0]._stepper, self._starts(number, worlds)
-            assert stepper is not None
-            stepper.enter(ahead, entries, rows)
-        episodes = MixedEpisodes([env for env, _ in groups.values()], torch.from_numpy(self._order))
+        self._join()
+
+    def _join(self) -> None:
+        """Find the row of each episode."""
+        self._order = np.argsort(self._members, kind="stable")[np.count_nonzero(self._members < 0) :]
+        episodes = MixedEpisodes([env for env, _ in self._groups.values()], torch.from_numpy(self._order))
         if self.observation.kind == "laws":
             self._laws = episodes.joined(TaskProgram.law_bytes).numpy()
-        return episodes  # type: ignore[return-value]  # same attributes
+        self.episodes = episodes  # type: ignore[assignment]  # same attributes
+
+    def _plan(self, worlds: Tensor) -> None:
+        """Plan the start worlds with these numbers, int64 [n]."""
+        worlds = worlds.unique()
+        rulesets = self.program.ruleset_of(worlds)
+        order, (numbers, counts) = rulesets.argsort(stable=True), rulesets.unique(return_counts=True)
+        self._needed = dict(zip(numbers.tolist(), worlds[order].split(counts.tolist()), strict=True))
+        self._ahead = {}
+        places = torch.empty_like(order)
+        places[order] = torch.cat([*map(torch.arange, counts.tolist())])
+        self._planned = worlds.numpy(), places.numpy()
+
+    def _entries(self, worlds: Tensor) -> Array:
+        """Return the numbers of worlds among `_starts`: int64 [n] each. Plans them if they are not planned."""
+        numbers, (known, places) = worlds.numpy(), self._planned
+        found = np.searchsorted(known, numbers)
+        if not np.array_equal(known.take(found, mode="clip"), numbers):
+            self._plan(worlds)
+            self._planned_from = None
+            return self._entries(worlds)
+        return places[found]
+
+    def _starts(self, number: int) -> Episodes:
+        """The planned starts under a ruleset: a batch of many takes little longer than one of a few."""
+        if number not in self._ahead:
+            program, needed = self._env(number).program, self._needed[number]
+            self._ahead[number] = program.start(needed, program.simulator.native(self.task.size[1]))
+        return self._ahead[number]
 
     # Stepping
 
@@ -302,97 +342,82 @@ class MixedEnv(CompiledEnv):
             or (numbers.view(np.uint64) >= self._most).any()
         ):
             self._checked(actions)
-        assert self.episodes is not None
-        step = self._step_apart if self._joint is None else self._joint.step
-        observed, reward, terminated, truncated, success, returned, length = step(numbers)
-        if self.observation.kind == "laws":
-            self._write_own(observed, slice(None))
-        active = np.ones(self.num_envs, bool)
-        waiting = self._ended
+        results, waiting = self._new_results(), self._ended.numpy()
+        (self._joint.step if self._joint else self._step_apart)(results)
         if mode is AutoresetMode.NEXT_STEP:
-            active = ~waiting.numpy()
-            reward = np.where(active, reward, 0)
-            terminated, truncated, success = terminated & active, truncated & active, success & active
-        self._returned = self._returned + torch.from_numpy(reward)
-        ended = terminated | truncated
-        info: dict[str, Any] = {
-            "success": success,
-            "_success": active,
-            "episode_return": returned * ended,
-            "episode_length": length * ended,
-            "_episode_return": ended,
-            "_episode_length": ended,
-        }
-        self._ended = torch.from_numpy(ended)
-        if mode is AutoresetMode.SAME_STEP:
-            last = {"world": self.episodes.seed.numpy().copy()}
-            last |= {name: info[name] for name in ("success", "episode_return", "episode_length")}
-            info["final_info"] = last | {f"_{name}": ended for name in last}
-            info["final_obs"] = observed[ended]
-            info["_final_obs"] = info["_final_info"] = ended
-            waiting, self._ended = self._ended, torch.zeros_like(self._ended)
-        if mode is not AutoresetMode.DISABLED:
-            self._next_episodes(waiting, observed)
-        info["world"], info["_world"] = self.episodes.seed.numpy().copy(), np.ones(self.num_envs, bool)
-        if self.shows_mask:
-            info["action_mask"] = self.action_masks().to(torch.int8).numpy()
-            info["_action_mask"] = info["_world"]
-        return observed, reward, terminated, truncated, info
+            results.active[:] = ~waiting
+            for name in (*COLUMNS, "ended"):
+                getattr(results, name)[waiting] = 0
+        self._write_own(results.observed)
+        ended = int(np.count_nonzero(results.ended))
+        if mode is not AutoresetMode.SAME_STEP:
+            self._ended = torch.from_numpy(results.ended.copy())
+        elif ended:
+            np.compress(results.ended, results.observed, 0, out=results.last_observed[:ended])
+            waiting = results.ended
+        if mode is not AutoresetMode.DISABLED and np.count_nonzero(waiting):
+            self._next_episodes(torch.from_numpy(waiting), results)
+        return self._steps(results, ended)
 
-    def _write_own(self, observed: Array, envs: Any) -> None:
-        """Write the laws of some environments into their observations, [n, …]."""
-        observed[:, 1].reshape(len(observed), -1)[:, : self._laws.shape[1]] = self._laws[envs]
+    def _write_own(self, observed: Array) -> None:
+        """Write laws into observations, if these have them."""
+        if self.observation.kind == "laws":
+            observed[:, 1].reshape(len(observed), -1)[:, : self._laws.shape[1]] = self._laws
 
-    def _step_apart(self, actions: Array) -> list[Array]:
-        """Step environment after environment; the columns of `COLUMNS`, rows in the order of `self`."""
-        parts = []
+    def _step_apart(self, results: Results) -> None:
+        """Step environment after environment."""
         for env, rows in self._groups.values():
             env._ended.zero_()  # waiting episodes step too; their results are masked below
-            *first, info = env.step_arrays(actions[rows])
-            parts.append([*first, *(info[name] for name in COLUMNS[4:])])
-        return [np.concatenate(column)[self._order] for column in zip(*parts, strict=True)]
+            observed, *parts, info = env.step_arrays(self._actions[rows])
+            columns = {**dict(zip(COLUMNS, parts, strict=False)), **info, "observed": observed}
+            for name in (*COLUMNS, "observed", "world"):
+                getattr(results, name)[rows[rows >= 0]] = columns[name][rows >= 0]
+        results.active[:] = results.everyone[:] = True
+        results.ended[:] = results.terminated | results.truncated
+        results.last_world[:] = results.world
 
-    def _next_episodes(self, mask: Tensor, observed: Array) -> None:
-        """Begin the next episodes where `mask`, bool [B], is set, and write their first observations."""
-        if not bool(mask.any()):
-            return
+    def _next_episodes(self, mask: Tensor, results: Results) -> None:
+        """Begin the next episodes where `mask`, bool [B], is set, and write what they observe to `results`."""
         assert self._base is not None
         self._episode, rows = self._episode + mask, mask.nonzero()[:, 0]
-        self._returned = self._returned.masked_fill(mask, 0)
         depth = min(len(self.program.rulesets), 2) * episodes_ahead(self.num_envs, self.task.size)
         if self.curriculum is None:
             base, first = self._planned_from or (None, self._episode)
             passed = (self._episode - first)[rows]
             if base is not self._base or not bool(((passed >= 0) & (passed < depth)).all()):
-                self._plan(self._base, self._episode + ~mask, depth)
+                first = self._episode + ~mask
+                episodes = first + torch.arange(depth)[:, None]
+                self._plan(self._choose(self._base.expand_as(episodes).flatten(), episodes.flatten()))
+                self._planned_from = self._base, first
         worlds = torch.zeros_like(self._episode)
         worlds[rows] = self._choose(self._base[rows], self._episode[rows])
-        self._restart(mask, worlds)
-        begun = mask.numpy()
-        if self._joint is not None:
-            shown = self._joint.observed[self._order[begun]]
-            if self.observation.kind == "laws":
-                self._write_own(shown, begun)
-            observed[begun] = shown
-            return
-        for env, members in self._groups.values():
-            places = np.flatnonzero((members >= 0) & begun[members])
-            if len(places):
-                assert env.episodes is not None
-                observed[members[places]] = env.observation.of(env.episodes).numpy()[places]
+        self._restart(mask, worlds, results)
+        if self._joint is None:
+            assert self.episodes is not None
+            begun = mask.numpy()
+            results.observed[begun] = self.observation.of(self.episodes).numpy()[begun]
+            results.world[begun] = worlds.numpy()[begun]
+        self._write_own(results.observed)
+
+    @property
+    def returns(self) -> Tensor:
+        """The return of each current episode so far: float64 [B]."""
+        if self.episodes is None:
+            return super().returns
+        return torch.cat([env.returns for env, _ in self._groups.values()])[self._order]
 
     # Saving
 
     def _saved(self, episodes: Episodes) -> dict[str, Any]:
         return {
             "groups": {
-                number: {"rows": torch.from_numpy(rows), "env": env.state()}
+                number: {"rows": torch.from_numpy(rows.copy()), "env": env.state()}
                 for number, (env, rows) in self._groups.items()
             },
         }
 
     def _loaded(self, state: Mapping[str, Any]) -> Episodes:
-        rows = {number: saved["rows"].numpy().copy() for number, saved in state["groups"].items()}
+        rows = {number: saved["rows"].numpy() for number, saved in state["groups"].items()}
         for number in rows:
             if not 0 <= number < len(self.program.rulesets):
                 raise ValueError(f"no ruleset {number}: there are {len(self.program.rulesets)}")
@@ -403,6 +428,6 @@ class MixedEnv(CompiledEnv):
         for number, (env, own) in groups.items():
             env.num_envs = len(own)
             env.restore(state["groups"][number]["env"])
-        busy, returns = members >= 0, torch.cat([env.returns for env, _ in groups.values()])
-        self._returned[members[busy]] = returns[busy]
-        return self._regroup(groups)
+        self._regroup(groups, self._new_results())
+        assert self.episodes is not None
+        return self.episodes

@@ -300,7 +300,7 @@ class TensorEnv:
     def progress(self) -> tuple[float, int]:
         """The return and the length so far of the only episode."""
         assert self.episodes is not None
-        return self._returned.item(), int(self.episodes.acted.item())
+        return self.returns.item(), int(self.episodes.acted.item())
 
     def _bases(self, seed: Any) -> tuple[Tensor, Tensor]:
         """The seed of each environment, and whether it is a new one."""

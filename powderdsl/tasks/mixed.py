@@ -45,11 +45,14 @@ class MixedEpisodes:
 
     def __init__(self, envs: Sequence[Playing], order: Tensor):
         self._envs, self.order = envs, order
-        self.seed = self.joined(lambda program, episodes: episodes.seed)
-        """The numbers of their start worlds, int64 [B]."""
 
     def __len__(self) -> int:
         return len(self.order)
+
+    @property
+    def seed(self) -> Tensor:
+        """The numbers of their start worlds, int64 [B]."""
+        return self.joined(lambda program, episodes: episodes.seed)
 
     @property
     def acted(self) -> Tensor:

@@ -255,7 +255,7 @@ def test_episodes_begin_in_idle_rows(mixed: Path) -> None:
             assert env.episodes is not None
             rulesets = env.program.ruleset_of(env.episodes.seed)
             assert env._joint is not None
-            assert len(env._joint.observed) > 24
+            assert len(env._members) > 24
             for number, (_, members) in env._groups.items():
                 assert sorted(members[members >= 0]) == (rulesets == number).nonzero()[:, 0].tolist()
     assert len(layouts) > 4
@@ -309,6 +309,8 @@ def test_native_worlds_draw_parameters_under_several_rulesets(tmp_path: Path) ->
         {},
         {"params": {"water.melt": 0.3}, "reset_mask": some},
         {"params": {}, "reset_mask": some},
+        {"params": {"water.melt": 0.3}},
+        {"params": {}},
     ):
         for env in envs:
             env.reset(seed=None if options else 6, options=options)

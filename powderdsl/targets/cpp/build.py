@@ -299,7 +299,6 @@ SIGNATURES = {
     "pd_program": "p p",
     "pd_shared": "p",
     "pd_new": "p piiii",
-    "pd_rest": "- pp",
     "pd_free": "- p",
     "pd_copy": "p p",
     "pd_run": "p pilippplippp",
@@ -314,7 +313,7 @@ SIGNATURES = {
     "pd_finish": "i p",
     "pd_begin": "- p",
     "pd_play": "l pp",
-    "pd_play_all": "- lpppi",
+    "pd_play_all": "- lpppppi",
     "pd_choose": "- ppp",
     "pd_observe": "- ppi",
 }

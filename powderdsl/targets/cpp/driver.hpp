@@ -380,10 +380,6 @@ static Batch* new_batch(Program& program, int worlds, const Grid& g) {
 API void* pd_new(Program* program, int worlds, int height, int width, int running) {
   return new_batch(*program, worlds, make_grid(*program, running ? running : worlds, height, width));
 }
-API void pd_rest(void* batch, const uint8_t* idle) {
-  Batch& b = *(Batch*)batch;
-  b.idle.assign(idle, idle + b.worlds);
-}
 API void pd_free(void* batch) {
   Batch* b = (Batch*)batch;
   for (Plane* p : b->slots) drop(b->g, p);

@@ -39,6 +39,7 @@ API powder_env* powder_new(int worlds) {
   Play& p = env->play;
   describe(p);
   p.pool = start_worlds(), p.start_worlds = WORLDS;
+  p.rows = worlds;
   p.batch = pd_new(&PROGRAM, worlds, ROWS, COLUMNS, 0);
   auto rows = [&](auto& vector, auto*& pointer, size_t size) { vector.resize(worlds * size), pointer = vector.data(); };
   rows(env->seed, p.seed, 1), rows(env->index, p.index, 1), rows(env->step, p.step, 1);

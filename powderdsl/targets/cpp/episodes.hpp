@@ -96,8 +96,12 @@ struct Play {
   // Observations, of `size` bytes.
   int64_t views, size;
   const View* view;
-  // Results: see `Results`. `last_observed` has room for all worlds.
+  // Actions and results: those of world i are at `places`, −1 if its cells do not matter; null: at i. `rows` results: see
+  // `Results`. `last_observed` has room for all worlds.
+  const int64_t* places;
+  int64_t rows;
   uint8_t *observed, *last_observed, *results;
+  int64_t place_of(int64_t i) const { return places ? places[i] : i; }
   // Kept between the parts of a step.
   int64_t* action;  // [worlds][5]: taken, left, painted, placed, blown
   uint8_t* begins;  // whether the next episode begins
@@ -151,8 +155,9 @@ static void act(Play& p, Batch& b, const int64_t* actions) {
   std::vector<float> speeds[2] = {std::vector<float>(worlds), std::vector<float>(worlds)};
   bool places = false, blows = false;
   for (int i = 0; i < worlds; i++) {
+    if (b.is_idle(i)) continue;
     int64_t five[5] = {0, 0, 0, 1, 1};
-    const int64_t* given = actions + i * p.numbers;
+    const int64_t* given = actions + p.place_of(i) * p.numbers;
     if (p.table) memcpy(five, p.table + 5 * given[0], sizeof five);
     else for (int k = 0; k < p.numbers; k++) five[p.column[k]] = given[k];
     const int64_t choice = p.choices[five[2]];
@@ -160,7 +165,7 @@ static void act(Play& p, Batch& b, const int64_t* actions) {
     done[PAINTED] = 0, done[PLACED] = choice >= 0, done[BLOWN] = choice == BLOW;
     chosen[i] = five[2];
     for (int axis = 0; axis < 2; axis++) speeds[axis][i] = (float)(p.speed * (double)(five[4 - axis] - 1));
-    if (choice < BLOW || p.waiting[i] || b.is_idle(i)) continue;
+    if (choice < BLOW || p.waiting[i]) continue;
     (choice < 0 ? blows : places) = true;
     int64_t* box = (choice < 0 ? blown : placed).data() + 4 * i;
     for (int axis = 0; axis < 2; axis++)
@@ -199,8 +204,9 @@ template <class P> static void run_some(P& p, Batch& b, const std::vector<int>& 
 API int64_t pd_act(Play* play, const int64_t* actions) {
   Play& p = *play;
   Batch& b = *(Batch*)p.batch;
-  for (int64_t i = 0; i < b.worlds * p.numbers; i++)
-    if ((u64)actions[i] >= (u64)p.most[i % p.numbers]) return i;
+  for (int i = 0; i < b.worlds; i++)
+    for (int64_t k = 0; k < p.numbers && !b.is_idle(i); k++)
+      if (const int64_t at = p.place_of(i) * p.numbers + k; (u64)actions[at] >= (u64)p.most[k]) return at;
   act(p, b, actions);
   pd_run(&b, 0, p.steps, p.threads, p.seed, p.index, p.step, 0, p.own_params, p.param_bits, p.param_reals, nullptr);
   std::vector<int> last;
@@ -268,10 +274,9 @@ static double value_of(const Play& p, const Formula& formula, int world, double*
   return *top;
 }
 static void observe(const Play& p, const Batch& b, int first, int last) {
-  for (int end; first < last; first = end) {
-    for (end = first + 1; end < last && b.is_idle(end) == b.is_idle(first);) end++;
-    if (!b.is_idle(first)) show(b, lanes_of(b, first, end), p.view, p.views, p.observed, p.size);
-  }
+  if (!p.places) return show(b, lanes_of(b, first, last), p.view, p.views, p.observed, p.size);
+  for (int i = first; i < last; i++)
+    if (!b.is_idle(i)) show(b, lanes_of(b, i, i + 1), p.view, p.views, p.observed + (p.places[i] - i) * p.size, p.size);
 }
 static int64_t drawn_world(const Play& p, int i) {  // as world_seeds of envs/tensor_env.py
   const u64 base = p.base[i];
@@ -298,7 +303,7 @@ API int pd_finish(Play* play) {
   const Batch& b = *(Batch*)p.batch;
   const int worlds = b.worlds;
   const size_t values = worlds * p.measures;
-  const Results r(p.results, worlds);
+  const Results r(p.results, p.rows);
   if (!p.counted) std::copy_n(p.before, values, p.now);
   std::vector<double> stack(std::max({p.each.count, p.final.count, p.success.count, p.failure.count}) + 1);
   bool ready = true;
@@ -316,13 +321,14 @@ API int pd_finish(Play* play) {
     if (waits) reward = 0, success = terminated = truncated = false;
     const bool ended = terminated || truncated;
     p.ended += ended;
-    r.reward[i] = (float)reward;
-    p.returned[i] += (double)r.reward[i];
-    r.terminated[i] = terminated, r.truncated[i] = truncated, r.succeeded[i] = success, r.ended[i] = ended;
-    r.active[i] = !waits, r.everyone[i] = true;  // each time, since callers may change them
-    r.episode_return[i] = (float)(p.returned[i] * ended);
-    r.episode_length[i] = p.acted[i] * ended;
-    r.last_shown[i] = p.world[i];
+    const int64_t at = p.place_of(i);
+    r.reward[at] = (float)reward;
+    p.returned[i] += (double)r.reward[at];
+    r.terminated[at] = terminated, r.truncated[at] = truncated, r.succeeded[at] = success, r.ended[at] = ended;
+    r.active[at] = !waits, r.everyone[at] = true;  // each time, since callers may change them
+    r.episode_return[at] = (float)(p.returned[i] * ended);
+    r.episode_length[at] = p.acted[i] * ended;
+    r.last_shown[at] = p.world[i];
     p.begins[i] = p.mode == NEXT_STEP ? waits : p.mode == SAME_STEP && ended;
     if (p.mode != SAME_STEP) p.waiting[i] = ended;
     ready &= !p.begins[i] || p.start_worlds || p.episode[i] + 1 < p.filled[i];
@@ -334,32 +340,40 @@ API int pd_finish(Play* play) {
 API void pd_begin(Play* play) {
   Play& p = *play;
   Batch& b = *(Batch*)p.batch;
-  const Results r(p.results, b.worlds);
+  const Results r(p.results, p.rows);
+  b.idle.resize(p.places ? b.worlds : 0);
   uint8_t* last = p.mode == SAME_STEP ? p.last_observed : nullptr;
   if (last) observe(p, b, 0, b.worlds);
   for (int i = 0; i < b.worlds; i++) {
+    if (p.places && (b.idle[i] = p.places[i] < 0)) continue;
     if (p.begins[i]) {
       if (last) memcpy(last, p.observed + i * p.size, p.size), last += p.size;
       begin(p, b, i);
       if (last) observe(p, b, i, i + 1);
     }
-    r.shown[i] = p.world[i];
+    r.shown[p.place_of(i)] = p.world[i];
   }
   if (!last) observe(p, b, 0, b.worlds);
 }
-// A step in one call. Returns what pd_act does; or -2 if the pool has to be filled before pd_begin.
+// A step in one call; without actions, only pd_begin. Returns what pd_act does; or -2 if the pool has to be filled before
+// pd_begin.
 API int64_t pd_play(Play* play, const int64_t* actions) {
-  const int64_t wrong = pd_act(play, actions);
-  if (wrong >= 0) return wrong;
-  if (!pd_finish(play)) return -2;
+  if (actions) {
+    const int64_t wrong = pd_act(play, actions);
+    if (wrong >= 0) return wrong;
+    if (!pd_finish(play)) return -2;
+  }
   pd_begin(play);
   return -1;
 }
-// Steps of the episodes of several libraries on some threads; `functions`: pd_play of each library.
+// Steps of the episodes of several libraries on some threads, with shared results; `functions`: pd_play of each library.
 using PlayFunction = int64_t(Play*, const int64_t*);
-API void pd_play_all(int64_t count, PlayFunction* const* functions, Play* const* plays, const int64_t* const* actions, int threads) {
+API void pd_play_all(int64_t count, PlayFunction* const* functions, Play* const* plays, const int64_t* actions, uint8_t* results, uint8_t* observed, int threads) {
   std::atomic<int64_t> next{0};
   on_threads((int)std::min<int64_t>(threads, count), [&](int) {
-    for (int64_t n; (n = next++) < count;) functions[n](plays[n], actions[n]);
+    for (int64_t n; (n = next++) < count;) {
+      plays[n]->results = results, plays[n]->observed = observed;
+      functions[n](plays[n], actions);
+    }
   });
 }

@@ -43,7 +43,7 @@ class Play(ctypes.Structure):
         *_whole("counts masks sizes measures mask_words own_masks"),
         *((name, Formula) for name in ("each", "final", "success", "failure")),
         *_whole("pool depth start_worlds base entry pool_world filled pool_start pool_sizes pool_masks"),
-        *_whole("views size view observed last_observed results action begins counted ended"),
+        *_whole("views size view places rows observed last_observed results action begins counted ended"),
     )
 
 
