@@ -262,6 +262,26 @@ def test_episodes_begin_in_idle_rows(mixed: Path) -> None:
     assert len({*map(id, layouts[1:])}) == 1
 
 
+@pytest.mark.parametrize("backend", ["wasm", "native"])
+def test_results_under_different_rules_stay_while_they_are_held(mixed: Path, backend: str) -> None:
+    from powderdsl.envs.mixed import MixedEnv
+
+    if backend == "native":
+        skip_without_compiler()
+    env = MixedEnv(mixed / "mixed.yaml", 5, backend=backend)
+    first, _ = env.reset(seed=3)
+    draws, held, ends = random.Random(4), [(first.numpy(), first.numpy().copy())], 0
+    for number in range(24):
+        observed, reward, *_, info = env.step_arrays(random_actions(env, draws).numpy())
+        ends += len(info["final_obs"])
+        if number % 3:
+            arrays = observed[1:], reward, info["final_obs"], info["world"], info["final_info"]["world"]
+            held += [(array, array.copy()) for array in arrays]
+        del observed, reward, info
+    assert ends > 5
+    assert all((array == copy).all() for array, copy in held)
+
+
 def test_rulesets_join_the_others_when_they_are_compiled(
     mixed: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
