@@ -436,7 +436,7 @@ class CompiledEnv(TensorEnv):
         return self._steps(results, stepper.play.ended)
 
     def _steps(self, results: Results, ended: int) -> Steps:
-        """What `step_arrays` returns, when some episodes have ended."""
+        """Return the results as `step_arrays` does; `ended`: the number of episodes that ended."""
         info = results.info.copy()
         if results.last_observed is not None:
             info["final_info"], info["final_obs"] = results.final_info.copy(), results.last_observed[:ended]

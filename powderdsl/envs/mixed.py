@@ -310,12 +310,12 @@ class MixedEnv(CompiledEnv):
     def _entries(self, worlds: Tensor) -> Array:
         """Return the numbers of worlds among `_starts`: int64 [n] each. Plans them if they are not planned."""
         numbers, (known, places) = worlds.numpy(), self._planned
-        found = np.searchsorted(known, numbers)
-        if not np.array_equal(known.take(found, mode="clip"), numbers):
+        indices = np.searchsorted(known, numbers)
+        if not np.array_equal(known.take(indices, mode="clip"), numbers):
             self._plan(worlds)
             self._planned_from = None
             return self._entries(worlds)
-        return places[found]
+        return places[indices]
 
     def _starts(self, number: int) -> Episodes:
         """The planned starts under a ruleset: a batch of many takes little longer than one of a few."""
