@@ -35,10 +35,10 @@ READY, EMPTY = -1, -2
 """Results of `pd_play`: done, or start worlds must be made before `pd_begin`."""
 
 
-def episodes_ahead(worlds: int, size: tuple[int, int]) -> int:
-    """The number of episodes of each environment for which start worlds are made at once."""
-    cells = worlds * size[0] * size[1]
-    return min(-(-POOL_CELLS // cells), max(MOST_AHEAD, FEW_CELLS // cells))
+def episodes_ahead(worlds: int, size: tuple[int, int], rulesets: int = 1) -> int:
+    """The number of episodes of each environment whose start worlds are planned together."""
+    cells, most = worlds * size[0] * size[1], POOL_CELLS * min(rulesets, 2)
+    return min(-(-most // cells), rulesets * max(MOST_AHEAD, FEW_CELLS // cells))
 
 
 Steps = tuple[Any, Any, Any, Any, dict[str, Any]]

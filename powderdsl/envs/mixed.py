@@ -12,7 +12,7 @@ import torch
 from gymnasium.vector import AutoresetMode
 from torch import Tensor
 
-from powderdsl.envs.compiled import CompiledEnv, Stepper, Steps, episodes_ahead, tensors_of
+from powderdsl.envs.compiled import POOL_CELLS, CompiledEnv, Stepper, Steps, episodes_ahead, tensors_of
 from powderdsl.envs.tensor_env import Info
 from powderdsl.tasks.compiled import Results
 from powderdsl.tasks.episodes import Episodes, TaskProgram, load_program
@@ -33,7 +33,7 @@ def environment(task: str | Path | Task | TaskProgram, num_envs: int = 1, **how:
 
 
 MOST_ROWS = 6
-"""Maximum number of rows per environment, including idle ones."""
+"""Maximum number of rows per environment, including idle ones, if they have more than `POOL_CELLS` cells."""
 
 COLUMNS = ("reward", "terminated", "truncated", "success", "episode_return", "episode_length")
 """Results of a step that are 0 while an episode waits: names of `Results`."""
@@ -62,7 +62,6 @@ class Joint:
             stepper.share(*rows)
             stepper.begin()
         self._play_all = steppers[0].native.library.pd_play_all
-        self._states = [stepper.state for stepper in steppers]
         self._calls = np.array([stepper.call for stepper in steppers], np.int64).T
         self._apart = np.array([stepper.measures_cells for stepper in steppers])
         self._arrange()
@@ -70,6 +69,7 @@ class Joint:
     def _arrange(self) -> None:
         """Find the steppers whose episodes are not all idle."""
         busy = self._of(self._members >= 0)
+        self._states = [self._steppers[part].state for part in np.flatnonzero(busy).tolist()]
         self._together = np.compress(busy & ~self._apart, self._calls, 1)
         self._alone = [self._steppers[part] for part in np.flatnonzero(busy & self._apart).tolist()]
         threads = self._steppers[0].native.threads
@@ -236,7 +236,8 @@ class MixedEnv(CompiledEnv):
             idle = np.count_nonzero(own < 0)
             if idle < new.sum() or (idle and joint is None) or (new.any() and self._has_params()):
                 held[number] = self._rebuild(number, own, envs[new], entries[new])
-        if joint is None or sum(map(len, held.values())) > MOST_ROWS * self.num_envs:
+        most = max(MOST_ROWS * self.num_envs, POOL_CELLS // math.prod(self.task.size))
+        if joint is None or sum(map(len, held.values())) > most:
             held = {number: rows for number, rows in held.items() if (rows >= 0).any()}
         self._regroup({number: (self._env(number), held[number]) for number in sorted(held)}, results)
 
@@ -250,7 +251,7 @@ class MixedEnv(CompiledEnv):
         stay, count, idle, env.running = len(staying), len(staying) + len(new), 0, 0
         if env.simulator.native(self.task.size[1]) is not None:
             usual = self.num_envs // len(self.program.rulesets)
-            idle = max(usual + 4 * math.isqrt(usual), count + count // 4) - count
+            idle = max(usual + 4 * math.isqrt(usual), count + -(-count // 4)) - count
             env.running = max(usual, count // 2, 1)
         members = np.concatenate([members[staying], new, np.full(idle, -1)])
         if not count:
@@ -380,7 +381,7 @@ class MixedEnv(CompiledEnv):
         """Begin the next episodes where `mask`, bool [B], is set, and write what they observe to `results`."""
         assert self._base is not None
         self._episode, rows = self._episode + mask, mask.nonzero()[:, 0]
-        depth = min(len(self.program.rulesets), 2) * episodes_ahead(self.num_envs, self.task.size)
+        depth = episodes_ahead(self.num_envs, self.task.size, len(self.program.rulesets))
         if self.curriculum is None:
             base, first = self._planned_from or (None, self._episode)
             passed = (self._episode - first)[rows]
@@ -392,8 +393,7 @@ class MixedEnv(CompiledEnv):
         worlds = torch.zeros_like(self._episode)
         worlds[rows] = self._choose(self._base[rows], self._episode[rows])
         self._restart(mask, worlds, results)
-        if self._joint is None:
-            assert self.episodes is not None
+        if self._joint is None and self.episodes is not None:
             begun = mask.numpy()
             results.observed[begun] = self.observation.of(self.episodes).numpy()[begun]
             results.world[begun] = worlds.numpy()[begun]
