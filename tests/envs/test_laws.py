@@ -262,6 +262,21 @@ def test_episodes_begin_in_idle_rows(mixed: Path) -> None:
     assert len({*map(id, layouts[1:])}) == 1
 
 
+def test_rulesets_without_episodes_keep_their_rows(mixed: Path) -> None:
+    from powderdsl.envs.mixed import MixedEnv
+
+    skip_without_compiler()
+    env = MixedEnv(mixed / "mixed.yaml", 1, backend="native")
+    env.reset(seed=1)
+    draws, layouts = random.Random(5), []
+    for _ in range(120):
+        env.step(random_actions(env, draws))
+        if len(env._groups) == 3:
+            layouts.append(env._joint)
+    assert len(layouts) > 20
+    assert len({*map(id, layouts)}) == 1
+
+
 @pytest.mark.parametrize("backend", ["wasm", "native"])
 def test_results_under_different_rules_stay_while_they_are_held(mixed: Path, backend: str) -> None:
     from powderdsl.envs.mixed import MixedEnv
