@@ -218,7 +218,7 @@ class Stepper(Plan):
         """Let the next calls read from arrays, [B] each, until it is bound anew.
 
         Args:
-            places: int64: the places of actions and results; −1: the episode is idle. A call of `begin` notices changes.
+            places: int64: the places of actions and results; −1: the episode is idle. Changes apply from `begin` on.
             entry: int64: the start worlds of the next episodes among those of `draw_from`.
             begins: bool: the episodes that begin.
         """

@@ -33,7 +33,7 @@ def environment(task: str | Path | Task | TaskProgram, num_envs: int = 1, **how:
 
 
 MOST_ROWS = 6
-"""Maximum number of rows per environment, including idle ones, if they have more than `POOL_CELLS` cells."""
+"""Rows per environment above which rulesets without episodes lose their rows, unless `POOL_CELLS` allows more rows."""
 
 COLUMNS = ("reward", "terminated", "truncated", "success", "episode_return", "episode_length")
 """Results of a step that are 0 while an episode waits: names of `Results`."""
@@ -46,7 +46,7 @@ class Joint:
         steppers: in order. The rows of their episodes follow one another.
         members: the number of the episode in each row, int64 [n]; −1: the row is idle. `begin` changes them.
         actions: where to read actions, int64 [B, k].
-        results: where to write what they observe first.
+        results: where to write the first observations.
     """
 
     def __init__(self, steppers: Sequence[Stepper], members: Array, actions: Array, results: Results):
@@ -89,16 +89,16 @@ class Joint:
         order, idle = np.argsort(parts, kind="stable"), np.flatnonzero(members < 0)
         parts, own = parts[order], self._parts[idle]
         places = np.searchsorted(own, parts) + np.arange(len(parts)) - np.searchsorted(parts, parts)
-        if len(places) and (places.max() >= len(idle) or (own[places] != parts).any()):
+        if places.max() >= len(idle) or (own[places] != parts).any():
             return None
         rows = np.empty_like(order)
         rows[order] = idle[places]
         return rows
 
     def begin(self, members: Array, rows: Array, entries: Array, results: Results) -> None:
-        """Continue with other members, and write to results what they observe.
+        """Continue with other members, and write their observations and worlds to `results`.
 
-        The members of some rows begin, in start worlds with these numbers, int64 [n] each.
+        Episodes begin in the rows `rows`, in the start worlds `entries`, int64 [n] each.
         """
         changed = members != self._members
         changed[rows] = self._begins[rows] = True
@@ -118,7 +118,7 @@ class Joint:
             stepper.step()
 
     def _call(self, calls: Array, actions: int | None, results: Results) -> None:
-        """Call functions with their arguments, int64 [2, n]; without the address of actions, to begin episodes."""
+        """Call functions with their arguments, int64 [2, n]; without an address of actions, episodes only begin."""
         for state in self._states:  # faster than `prepare`
             state.forget()
         functions, count, addresses = calls.ctypes.data, calls.shape[1], results.addresses
@@ -186,7 +186,7 @@ class MixedEnv(CompiledEnv):
     # Beginning
 
     def _restart(self, mask: Tensor, worlds: Tensor, results: Results | None = None) -> None:
-        """Begin episodes where `mask`, bool [B], is set, in the worlds with these numbers; `results`: see `Joint`."""
+        """Begin episodes where `mask`, bool [B], is set, in the worlds numbered `worlds`; `results`: see `Joint`."""
         results = results or self._new_results()
         envs = mask.nonzero()[:, 0].numpy()
         numbers, entries = self.program.ruleset_of(worlds[mask]).numpy(), self._entries(worlds[mask])
@@ -274,7 +274,7 @@ class MixedEnv(CompiledEnv):
         return members
 
     def _regroup(self, groups: Groups, results: Results) -> None:
-        """Continue with the episodes of these groups, and write what they observe to `results`."""
+        """Continue with the episodes of these groups, and write their observations to `results`."""
         envs, rows = zip(*groups.values(), strict=True)
         self._members = np.concatenate(rows)
         parts = np.split(self._members, np.cumsum([*map(len, rows)]))
@@ -378,7 +378,7 @@ class MixedEnv(CompiledEnv):
         results.last_world[:] = results.world
 
     def _next_episodes(self, mask: Tensor, results: Results) -> None:
-        """Begin the next episodes where `mask`, bool [B], is set, and write what they observe to `results`."""
+        """Begin the next episodes where `mask`, bool [B], is set, and write first observations to `results`."""
         assert self._base is not None
         self._episode, rows = self._episode + mask, mask.nonzero()[:, 0]
         depth = episodes_ahead(self.num_envs, self.task.size, len(self.program.rulesets))

@@ -36,8 +36,8 @@ ALWAYS V draw_plane(const Context& c, int stream, const Start& start, int j) {
   }
   return (V)bits;
 }
-// Several planes at once: the multiplications of one wait for each other, and after so many hardly a cell is open, so that the
-// processor foresees whether there are more.
+// Several planes at once: the multiplications of one plane depend on each other. After this number of planes few cells are
+// open, so that the processor predicts the branch.
 constexpr int AHEAD = VECTOR == 64 ? 8 : 4;
 #define EACH_AHEAD _Pragma("GCC unroll 8") for (int i = 0; i < AHEAD; i++)
 struct Drawn { V plane[AHEAD]; };

@@ -552,7 +552,7 @@ API void* pd_run(void* batch, int copy, int64_t steps, int threads, const u64* s
   on_threads(count, task);
   return batch;
 }
-// For programs that are libraries of their own, see pd_program.
+// The functions that separate libraries of passes call: see pd_program.
 API void* const* pd_shared() {
 #define EACH(result, name, ...) (void*)name,
   static void* const functions[] = {SHARED(EACH)};
